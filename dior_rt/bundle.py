@@ -27,6 +27,7 @@ from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 FORMAT: Final = 1
 MANIFEST = "manifest.json"
 MOST_MANIFEST_BYTES = 1 << 20
+MOST_STEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -40,11 +41,16 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Graph:
-    """One ONNX graph: its file in the bundle and its tensors in the order of the graph."""
+    """One ONNX graph: its file in the bundle, and its tensors in the order of the graph.
+
+    probe: an .npz in the bundle with one set of inputs and the outputs torch gives for them, by the tensors'
+    names; every device is held to it.
+    """
 
     file: str
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
+    probe: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,18 +83,22 @@ class Manifest:
     settings: dict[str, str | int | float | bool | None]
 
     def __post_init__(self) -> None:
-        if not 1 <= self.steps <= 1000:
-            raise ValueError(f"steps must lie between 1 and 1000, not {self.steps}")
+        if not 1 <= self.steps <= MOST_STEPS:
+            raise ValueError(f"steps must lie between 1 and {MOST_STEPS}, not {self.steps}")
         for name, value in (("guidance", self.guidance), ("noise_scale", self.noise_scale)):
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} must be a number of at least 0, not {value}")
         if self.grid and not (self.grid.cells >= 1 and 1 <= self.grid.multiple <= self.grid.longest):
             raise ValueError("grid needs cells >= 1 and 1 <= multiple <= longest")
-        for path in (*self.files, *(graph.file for graph in self.graphs.values())):
+        for path in (*self.files, *self.graph_files()):
             _check_relative(path)
         for digest in self.files.values():
             if not re.fullmatch("[0-9a-f]{64}", digest):
                 raise ValueError(f"{digest[:80]!r} is no sha256")
+
+    def graph_files(self) -> list[str]:
+        """The files that the graphs name."""
+        return [file for graph in self.graphs.values() for file in (graph.file, graph.probe) if file]
 
 
 @dataclass(frozen=True)
@@ -120,9 +130,8 @@ def read_bundle(folder: Path) -> Bundle:
     or whose manifest names a path outside the folder.
     """
     manifest = _read_manifest(folder)
-    for name, graph in manifest.graphs.items():
-        if graph.file not in manifest.files:
-            raise BundleError(f"The bundle {folder} names no sha256 for the file of its graph {name!r}.")
+    if unlisted := set(manifest.graph_files()) - manifest.files.keys():
+        raise BundleError(f"The bundle {folder} names no sha256 for its file {min(unlisted)!r}.")
     for relative, digest in manifest.files.items():
         _check_file(folder, relative, digest)
     return Bundle(folder, manifest)

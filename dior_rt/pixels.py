@@ -1,0 +1,97 @@
+"""Photos and strokes in memory: arrays and Pillow images to the arrays that the kernels take, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from dior_rt.errors import InputError
+from dior_rt.kernels import Strokes
+
+Picture = Image.Image | NDArray
+
+SHAPE_TOLERANCE = (
+    0.01  # of a side; resizing by any whole number of pixels stays within it, or within one pixel
+)
+
+
+def read_pixels(photo: Picture) -> NDArray:
+    """The photo's (H, W, 3) pixels, sRGB, without alpha. Raises InputError."""
+    if isinstance(photo, Image.Image):
+        _check_8_bit(photo)
+        return np.asarray(photo.convert("RGB"))
+    pixels = np.asarray(photo)
+    _check_array("a photo", pixels, channels=3)
+    if pixels.dtype == np.float32 and not (np.isfinite(pixels).all() and pixels.min() >= 0):
+        raise InputError("A float photo must be finite and >= 0.")
+    return pixels
+
+
+def like_photo(pixels: NDArray, photo: Picture) -> Picture:
+    """The pixels as the photo's kind: a Pillow image gets the photo's alpha, and its ICC and EXIF data."""
+    if not isinstance(photo, Image.Image):
+        return pixels
+    picture = Image.fromarray(pixels)
+    if photo.has_transparency_data:
+        picture.putalpha(photo.convert("RGBA").getchannel("A"))
+    picture.info = {key: photo.info[key] for key in ("icc_profile", "exif") if key in photo.info}
+    return picture
+
+
+def read_strokes(strokes: Strokes | Picture) -> tuple[NDArray, NDArray]:
+    """The strokes' light (H, W, 3) and mask (H, W). Raises InputError.
+
+    RGBA pictures: alpha is the mask; integers are sRGB-encoded, floats are linear.
+    """
+    if isinstance(strokes, Strokes):
+        light, mask = np.asarray(strokes.light, np.float32), np.asarray(strokes.mask, np.float32)
+    else:
+        rgba = _read_rgba(strokes)
+        light, mask = rgba[..., :3], rgba[..., 3]
+    if light.shape != (*mask.shape, 3) or mask.ndim != 2 or mask.size == 0:
+        raise InputError(f"Strokes need light (rows, columns, 3) and a mask of its size, not {light.shape}.")
+    if mask.dtype == np.float32 and not (mask.min() >= 0 and mask.max() <= 1):
+        raise InputError("The strokes' mask must lie in 0..1.")
+    if light.dtype == np.float32:
+        drawn = light[mask > 0]
+        if not (np.isfinite(drawn).all() and (drawn >= 0).all()):
+            raise InputError("The strokes' light must be finite and >= 0.")
+    return light, mask
+
+
+def check_same_shape(strokes: tuple[int, ...], photo: tuple[int, ...]) -> None:
+    """InputError unless two (rows, columns) are the same shape, whatever their size."""
+    (h, w), (rows, columns) = strokes, photo
+    apart = [(w, h * columns / rows), (h, w * rows / columns)]
+    if not any(abs(side - wanted) <= max(1, SHAPE_TOLERANCE * wanted) for side, wanted in apart):
+        raise InputError(
+            f"The strokes are {w} x {h} pixels and the photo is {columns} x {rows}: the shapes differ."
+        )
+
+
+def _read_rgba(picture: Picture) -> NDArray:
+    if not isinstance(picture, Image.Image):
+        pixels = np.asarray(picture)
+        _check_array("strokes", pixels, channels=4)
+        return pixels
+    _check_8_bit(picture)
+    if not picture.has_transparency_data:
+        raise InputError("The strokes have no alpha channel to say where light was drawn.")
+    return np.asarray(picture.convert("RGBA"))
+
+
+def _check_8_bit(picture: Image.Image) -> None:
+    if picture.mode.startswith(("I", "F")):
+        raise InputError(f"A Pillow image of mode {picture.mode} has no 8-bit colour; pass an array instead.")
+    if 0 in picture.size:
+        raise InputError("The image has no pixels.")
+
+
+def _check_array(what: str, pixels: NDArray, channels: int) -> None:
+    fits = pixels.ndim == 3 and pixels.shape[2] == channels and pixels.size > 0
+    if not fits or pixels.dtype not in (np.uint8, np.uint16, np.float32):
+        raise InputError(
+            f"As an array {what} must be (rows, columns, {channels}) of uint8, uint16 or float32, "
+            f"not {pixels.shape} of {pixels.dtype}."
+        )

@@ -1,0 +1,185 @@
+"""Relight a photo: the way of a picture from pixels to pixels. Load once, relight many.
+
+from PIL import Image
+from dior_rt import Relighter
+
+relighter = Relighter()
+relit = relighter.relight(Image.open("photo.jpg"), Image.open("strokes.png"))
+relit.picture.save("relit.png")
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dior_rt.bundle import MOST_STEPS, default_bundle, read_bundle
+from dior_rt.errors import Cancelled, DeviceError, InputError
+from dior_rt.family import mini
+from dior_rt.kernels import KernelError, Strokes, open_ops
+from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
+from dior_rt.sampler import Array, Condition, draw_noise, guided, sample
+
+Progress = Callable[[int, int], bool | None]
+
+NOTHING_DRAWN = "The strokes specify nothing, so the photo is unchanged."
+
+
+@dataclass(frozen=True)
+class Relit:
+    """A relit photo and how it came about.
+
+    picture: of the photo's kind, dtype and size. notice: what the person should know, or None.
+    seconds: by stage (kernels, steps, transfer). steps, guidance, seed, intensity: as used.
+    """
+
+    picture: Picture
+    notice: str | None
+    seconds: dict[str, float]
+    steps: int
+    guidance: float
+    seed: int
+    intensity: float
+
+
+class Relighter:
+    """A model on a device. Safe to use from several threads.
+
+    device, ops: what runs the network and the pixel kernels; device_reason, ops_reason: why these.
+    """
+
+    def __init__(
+        self,
+        bundle: Path | str | None = None,
+        device: str = "auto",
+        ops: str = "auto",
+        threads: int | None = None,
+    ) -> None:
+        """Load a bundle; None is the one that ships with the package.
+
+        device: for the network, "auto", "cpu", "cuda" ... ops: "auto", "numpy", "opencl", "opencl:<which>".
+        threads: CPU threads for the network. Raises BundleError, and DeviceError for a device that is not
+        there or computes wrong results.
+        """
+        self.bundle = read_bundle(Path(bundle) if bundle else default_bundle())
+        self._network = mini.Mini(self.bundle, device, threads)
+        try:
+            self._ops = open_ops(ops)
+        except KernelError as error:
+            raise DeviceError(str(error)) from error
+        self.device, self.device_reason = self._network.engine.device, self._network.engine.reason
+        self.ops, self.ops_reason = self._ops.name, self._ops.reason
+
+    def relight(
+        self,
+        photo: Picture,
+        strokes: Strokes | Picture,
+        *,
+        steps: int | None = None,
+        guidance: float | None = None,
+        seed: int = 0,
+        intensity: float = 1.0,
+        progress: Progress | None = None,
+    ) -> Relit:
+        """The photo under the light of the strokes.
+
+        photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
+        strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
+        sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size.
+        steps, guidance: None takes the model's own. intensity: multiplies the light, >= 0.
+        progress: called after each step with (step, steps); returning False stops with Cancelled.
+
+        Raises InputError for what cannot be used, and DeviceError where a device fails.
+        """
+        manifest = self.bundle.manifest
+        steps = manifest.steps if steps is None else steps
+        guidance = manifest.guidance if guidance is None else guidance
+        _check_settings(steps, guidance, seed, intensity)
+        watch = Stopwatch()
+        pixels = read_pixels(photo)
+        grid = self._network.grid.shape(*pixels.shape[:2])
+        drawn = self._reduce_strokes(strokes, pixels.shape[:2], grid, intensity)
+        if not drawn.mask.any():
+            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, steps, guidance, seed, intensity)
+        source, encoded = self._reduce_photo(pixels, grid)
+        watch.lap("kernels")
+        x0 = self._sample(mini.encode(encoded, drawn, "relight"), steps, guidance, seed, progress)
+        watch.lap("steps")
+        relit = self._ops.decode_srgb(mini.decode_relit(x0, encoded))
+        picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
+        watch.lap("transfer")
+        return Relit(picture, None, watch.seconds, steps, guidance, seed, intensity)
+
+    def estimate(
+        self, photo: Picture, *, steps: int | None = None, seed: int = 0, progress: Progress | None = None
+    ) -> Array:
+        """The photo's own light: a dense Lumi map (h, w, 3), linear float32 >= 0, of its light grid.
+
+        Arguments and errors are those of `relight`.
+        """
+        steps = self.bundle.manifest.steps if steps is None else steps
+        _check_settings(steps, 1.0, seed, 1.0)
+        pixels = read_pixels(photo)
+        _, encoded = self._reduce_photo(pixels, self._network.grid.shape(*pixels.shape[:2]))
+        return mini.decode_lumi(
+            self._sample(mini.encode(encoded, None, "estimate"), steps, 1.0, seed, progress)
+        )
+
+    def _reduce_photo(self, pixels: NDArray, grid: tuple[int, int]) -> tuple[Array, Array]:
+        """The photo's light grid, linear and sRGB-encoded."""
+        source = self._ops.reduce_photo(pixels, grid)
+        return source, np.clip(self._ops.encode_srgb(source, np.float32), 0, 1)
+
+    def _reduce_strokes(
+        self, strokes: Strokes | Picture, size: tuple[int, int], grid: tuple[int, int], intensity: float
+    ) -> Strokes:
+        light, mask = read_strokes(strokes)
+        if mask.shape != grid:
+            check_same_shape(mask.shape, size)
+        drawn = self._ops.reduce_strokes(light, mask, grid)
+        with np.errstate(over="ignore"):
+            drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
+        if not np.isfinite(drawn.light).all():
+            raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
+        return drawn
+
+    def _sample(
+        self, condition: Condition, steps: int, guidance: float, seed: int, progress: Progress | None
+    ) -> Array:
+        """The state at the end of the flow, (1, 3, h, w)."""
+        noise = np.float32(self.bundle.manifest.noise_scale) * draw_noise(seed, condition["photo"].shape)
+        velocity = guided(self._network.bind, condition, mini.null(condition), guidance)
+        for state in sample(velocity, noise, self._network.schedule.sigmas(steps)):
+            if progress and progress(state.step, state.steps) is False:
+                raise Cancelled(f"Stopped after step {state.step} of {state.steps}.")
+        return state.x
+
+
+class Stopwatch:
+    """Seconds by stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Book the time since the last lap on `stage`."""
+        now = perf_counter()
+        self.seconds[stage], self._last = now - self._last, now
+
+
+def _check_settings(steps: int, guidance: float, seed: int, intensity: float) -> None:
+    if not 1 <= steps <= MOST_STEPS:
+        raise InputError(f"steps must lie between 1 and {MOST_STEPS}, not {steps}.")
+    if not (math.isfinite(guidance) and guidance >= 0):
+        raise InputError(f"guidance must be a number of at least 0, not {guidance}.")
+    if not (math.isfinite(intensity) and intensity >= 0):
+        raise InputError(f"intensity must be a number of at least 0, not {intensity}.")
+    if seed < 0:
+        raise InputError(f"seed must be at least 0, not {seed}.")
