@@ -1,0 +1,257 @@
+"""Writes one ONNX graph, operation by operation, streaming its weights to a file beside it.
+
+A graph is built by hand rather than traced so that no weight has to exist while its graph is made, and so that the
+fused operations of ONNX Runtime (attention that never holds the whole matrix of scores, rotary embedding, block-wise
+int4) and the casts of mixed precision stand where they are meant to.
+
+Activations are float32 (tokens, width) between operations, in every precision. Only `linear` and `attention` compute
+in less, and each first divides what it rounds by its largest value, so that nothing can overflow:
+
+    fp32   y = x W + b
+    fp16   y = s (fp16(x / s) fp16(W)) + b                  s = the row's largest |x|
+    int8   y = s t (int8(127 x / s) int8(W / t)) + b        t = the column's largest |W| / 127 (weights per channel)
+    int4   y = x Q + b                                      Q = int4 by blocks of 32 along the input (MatMulNBits)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, BinaryIO, Literal, get_args
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import TensorProto, helper
+
+from dior_rt.bundle import Graph, Tensor
+
+Precision = Literal["fp32", "fp16", "int8", "int4"]
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+OPSET = 20
+CONTRIB = "com.microsoft"
+ALIGNMENT = 4096  # the page size: weights can be mapped into memory
+INLINE_BYTES = 1024
+BLOCK = 32  # int4 weights that share one scale
+TINY = 1e-20  # stands in for the largest value of a row of zeros
+ONNX_TYPES = {"float32": TensorProto.FLOAT, "int64": TensorProto.INT64}
+
+Array = NDArray[Any]
+
+
+class GraphWriter:
+    """One graph in the making; values are named by the strings that its methods return.
+
+    Use as a context manager: leaving it closes the weights' file. `finish` writes the graph.
+    """
+
+    def __init__(self, path: Path, precision: Precision = "fp32") -> None:
+        """Weights go to `path` with the suffix .data, from the first one on."""
+        self.path, self.precision = path, precision
+        self._nodes: list[onnx.NodeProto] = []
+        self._weights: list[TensorProto] = []
+        self._inputs: list[Tensor] = []
+        self._outputs: list[Tensor] = []
+        self._data: BinaryIO | None = None
+        self._count = 0
+
+    def __enter__(self) -> GraphWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._data:
+            self._data.close()
+
+    @property
+    def data_path(self) -> Path:
+        return self.path.with_suffix(".data")
+
+    def input(self, name: str, *shape: int | str, dtype: str = "float32") -> str:
+        self._inputs.append(Tensor(name, dtype, shape))
+        return name
+
+    def output(self, name: str, value: str, *shape: int | str) -> None:
+        self._nodes.append(helper.make_node("Identity", [value], [name]))
+        self._outputs.append(Tensor(name, "float32", shape))
+
+    def op(self, kind: str, *inputs: str, domain: str = "", **attributes: Any) -> str:
+        """Append an operation of one output. A trailing optional input that is left out is "" (as in ONNX)."""
+        return self.ops(kind, 1, *inputs, domain=domain, **attributes)[0]
+
+    def ops(self, kind: str, outputs: int, *inputs: str, domain: str = "", **attributes: Any) -> list[str]:
+        """Append an operation of several outputs."""
+        names = [self._name(kind) for _ in range(outputs)]
+        self._nodes.append(helper.make_node(kind, list(inputs), names, domain=domain, **attributes))
+        return names
+
+    def constant(self, value: Array) -> str:
+        """A tensor of the graph; large ones go to the file of weights."""
+        value = np.ascontiguousarray(value)
+        proto = TensorProto(
+            name=self._name("constant"),
+            dims=value.shape,
+            data_type=helper.np_dtype_to_tensor_dtype(value.dtype),
+        )
+        if value.nbytes <= INLINE_BYTES:
+            proto.raw_data = value.tobytes()
+        else:
+            self._store(proto, value)
+        self._weights.append(proto)
+        return proto.name
+
+    def scalar(self, value: float) -> str:
+        return self.constant(np.float32(value))
+
+    def ints(self, *values: int) -> str:
+        return self.constant(np.array(values, np.int64))
+
+    def finish(self, name: str) -> Graph:
+        """Write the graph; return its description with the file's bare name."""
+        graph = helper.make_graph(
+            self._nodes,
+            name,
+            [_value_info(tensor) for tensor in self._inputs],
+            [_value_info(tensor) for tensor in self._outputs],
+            self._weights,
+        )
+        opsets = [helper.make_opsetid("", OPSET), helper.make_opsetid(CONTRIB, 1)]
+        # IR 10 is the newest that ONNX Runtime 1.20 reads.
+        model = helper.make_model(graph, opset_imports=opsets, ir_version=10, producer_name="dior-rt")
+        self.path.write_bytes(model.SerializeToString())
+        onnx.checker.check_model(str(self.path))
+        return Graph(self.path.name, tuple(self._inputs), tuple(self._outputs))
+
+    def linear(self, x: str, weight: Array, bias: Array | None, precision: Precision | None = None) -> str:
+        """y = x W^T + b for x (rows, in) and a float32 weight (out, in), in this graph's precision or the one given."""
+        precision = precision or self.precision
+        if precision == "fp32":
+            inputs = [x, self.constant(weight), *([] if bias is None else [self.constant(bias)])]
+            return self.op("Gemm", *inputs, transB=1)
+        y = {"fp16": self._linear_fp16, "int8": self._linear_int8, "int4": self._linear_int4}[precision](x, weight)
+        return y if bias is None else self.op("Add", y, self.constant(bias))
+
+    def layer_norm(self, x: str, width: int, eps: float) -> str:
+        """(x - mean) / sqrt(variance + eps) over the last axis, without scale and shift."""
+        return self.op("LayerNormalization", x, self.constant(np.ones(width, np.float32)), epsilon=eps)
+
+    def rms_norm(self, x: str, scale: Array, eps: float) -> str:
+        """x / sqrt(mean(x^2) + eps) * scale over the last axis."""
+        mean = self.op("ReduceMean", self.op("Mul", x, x), self.ints(-1), keepdims=1)
+        root = self.op("Sqrt", self.op("Add", mean, self.scalar(eps)))
+        return self.op("Mul", self.op("Div", x, root), self.constant(scale))
+
+    def head_norm(self, x: str, heads: int, scale: Array, eps: float) -> str:
+        """`rms_norm` of each head of x (tokens, heads * head width) by itself."""
+        split = self.op("Reshape", x, self.ints(0, heads, -1))
+        return self.op("Reshape", self.rms_norm(split, scale, eps), self.ints(0, -1))
+
+    def rotate(self, x: str, cos: str, sin: str, *, interleaved: bool) -> str:
+        """Rotary embedding of every head of x (tokens, width) by the angles of (tokens, head width / 2).
+
+        interleaved: the pairs that turn are neighbours (0, 1), (2, 3) ..., else the halves (0, d/2), (1, d/2 + 1) ...
+        """
+        rows = self.op("Unsqueeze", x, self.ints(0))
+        turned = self.op(
+            "RotaryEmbedding", rows, self.ints(0), cos, sin, domain=CONTRIB, interleaved=int(interleaved)
+        )
+        return self.op("Squeeze", turned, self.ints(0))
+
+    def attention(
+        self, q: str, k: str, v: str, heads: int, *, bias: str = "", causal: bool = False
+    ) -> str:
+        """softmax(q k^T / sqrt(head width) + bias) v, head by head, for (tokens, heads * head width) each.
+
+        bias: (1, 1, tokens, tokens), or "" for none.
+        """
+        scale = ""
+        if self.precision == "fp16":
+            q, k = (self.op("Cast", value, to=TensorProto.FLOAT16) for value in (q, k))
+            largest = self.op("ReduceMax", self.op("Abs", v), keepdims=0)
+            scale = self.op("Max", largest, self.scalar(TINY))
+            v = self.op("Cast", self.op("Div", v, scale), to=TensorProto.FLOAT16)
+            bias = bias and self.op("Cast", bias, to=TensorProto.FLOAT16)
+        rows = [self.op("Unsqueeze", value, self.ints(0)) for value in (q, k, v)]
+        optional = ["", "", bias] if bias else []
+        mixed = self.op(
+            "MultiHeadAttention", *rows, *optional, domain=CONTRIB, num_heads=heads, unidirectional=int(causal)
+        )
+        mixed = self.op("Squeeze", mixed, self.ints(0))
+        if not scale:
+            return mixed
+        return self.op("Mul", self.op("Cast", mixed, to=TensorProto.FLOAT), scale)
+
+    def _linear_fp16(self, x: str, weight: Array) -> str:
+        half, scale = self._by_largest(x)
+        half = self.op("Cast", half, to=TensorProto.FLOAT16)
+        y = self.op("MatMul", half, self.constant(weight.T.astype(np.float16)))
+        return self.op("Mul", self.op("Cast", y, to=TensorProto.FLOAT), scale)
+
+    def _linear_int8(self, x: str, weight: Array) -> str:
+        unit, scale = self._by_largest(x)
+        rounded = self.op("Round", self.op("Mul", unit, self.scalar(127)))
+        step = np.maximum(np.abs(weight).max(1, keepdims=True), TINY) / 127
+        quantized = self.constant(np.rint(weight / step).astype(np.int8).T)
+        y = self.op("MatMulInteger", self.op("Cast", rounded, to=TensorProto.INT8), quantized)
+        y = self.op("Mul", self.op("Cast", y, to=TensorProto.FLOAT), self.constant((step[:, 0] / 127).astype(np.float32)))
+        return self.op("Mul", y, scale)
+
+    def _linear_int4(self, x: str, weight: Array) -> str:
+        packed, scales = quantize_int4(weight)
+        return self.op(
+            "MatMulNBits",
+            x,
+            self.constant(packed),
+            self.constant(scales),
+            domain=CONTRIB,
+            K=weight.shape[1],
+            N=weight.shape[0],
+            bits=4,
+            block_size=BLOCK,
+            accuracy_level=1,
+        )
+
+    def _by_largest(self, x: str) -> tuple[str, str]:
+        """x with every row divided by its largest |value|, and those values (rows, 1)."""
+        largest = self.op("ReduceMax", self.op("Abs", x), self.ints(-1), keepdims=1)
+        scale = self.op("Max", largest, self.scalar(TINY))
+        return self.op("Div", x, scale), scale
+
+    def _store(self, proto: TensorProto, value: Array) -> None:
+        if self._data is None:
+            self._data = self.data_path.open("wb")
+        offset = -(-self._data.tell() // ALIGNMENT) * ALIGNMENT
+        self._data.seek(offset)
+        self._data.write(value)
+        proto.data_location = TensorProto.EXTERNAL
+        for key, item in (("location", self.data_path.name), ("offset", offset), ("length", value.nbytes)):
+            proto.external_data.add(key=key, value=str(item))
+
+    def _name(self, kind: str) -> str:
+        self._count += 1
+        return f"{kind}_{self._count}"
+
+
+def quantize_int4(weight: Array) -> tuple[Array, Array]:
+    """Symmetric int4 by blocks of 32 inputs, as MatMulNBits stores it.
+
+    weight: float32 (out, in). Returns uint8 (out, blocks, 16) of two values a byte, the lower half first, each 8 above
+    what it stands for, and float32 scales (out * blocks,). The value of largest magnitude in a block is exact.
+    """
+    rows, columns = weight.shape
+    blocks = -(-columns // BLOCK)
+    padded = np.zeros((rows, blocks * BLOCK), np.float32)
+    padded[:, :columns] = weight
+    padded = padded.reshape(rows, blocks, BLOCK)
+    extreme = np.take_along_axis(padded, np.abs(padded).argmax(-1, keepdims=True), -1)
+    scale = extreme / -8
+    steps = np.divide(padded, scale, out=np.zeros_like(padded), where=scale != 0)
+    levels = np.clip(np.rint(steps) + 8, 0, 15).astype(np.uint8)
+    return levels[..., ::2] | levels[..., 1::2] << 4, scale.reshape(-1)
+
+
+def _value_info(tensor: Tensor) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(tensor.name, ONNX_TYPES[tensor.dtype], _dims(tensor.shape))
+
+
+def _dims(shape: Sequence[int | str]) -> list[int | str]:
+    return list(shape)

@@ -1,0 +1,138 @@
+"""Weights on disk, read one tensor at a time: memory holds what is being converted, never a whole model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+
+from dior_rt.errors import InputError
+from dior_rt.export.qwen.lora import Lora
+
+Array = NDArray[np.float32]
+
+INDEX = ".safetensors.index.json"
+# What checkpoints of one file, and newer transformers, put where diffusers' folders have the right-hand side.
+RENAMED = (
+    ("model.diffusion_model.", ""),
+    ("diffusion_model.", ""),
+    ("model.language_model.", "model."),
+    ("model.visual.", "visual."),
+)
+READABLE = (torch.float32, torch.float16, torch.bfloat16)
+
+
+class Weights(Protocol):
+    """Named float32 tensors."""
+
+    def shape(self, name: str) -> tuple[int, ...]: ...
+
+    def __getitem__(self, name: str) -> Array: ...
+
+
+class Checkpoint:
+    """The tensors of a safetensors file, or of a folder of them with diffusers' or transformers' index."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where there are no weights at `path`, or shards are missing or cut short."""
+        self.path = path
+        self._places = {_plain(key): (file, key) for file in _shards(path) for key in _keys(file)}
+
+    @property
+    def names(self) -> Iterable[str]:
+        return self._places.keys()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        file, key = self._place(name)
+        with safe_open(file, framework="pt") as tensors:
+            return tuple(tensors.get_slice(key).get_shape())
+
+    def __getitem__(self, name: str) -> Array:
+        file, key = self._place(name)
+        try:
+            with safe_open(file, framework="pt") as tensors:
+                tensor = tensors.get_tensor(key)
+        except (OSError, SafetensorError) as error:
+            raise InputError(f"Cannot read {key!r} from {file}: {error}.") from error
+        if tensor.dtype not in READABLE:
+            raise InputError(f"{file} stores {key!r} as {tensor.dtype}; export needs float32, float16 or bfloat16.")
+        if not torch.isfinite(tensor).all():
+            raise InputError(f"{file} is damaged: {key!r} holds values that are not finite.")
+        return tensor.float().numpy()
+
+    def _place(self, name: str) -> tuple[Path, str]:
+        if name not in self._places:
+            raise InputError(f"{self.path} has no tensor {name!r}; is it the model that its config describes?")
+        return self._places[name]
+
+
+class Merged:
+    """A checkpoint with LoRAs added: W + sum of strength * alpha / rank * B A, tensor by tensor.
+
+    Raises InputError for a LoRA that speaks of layers the checkpoint does not have, or of another width.
+    """
+
+    def __init__(self, base: Checkpoint, loras: Sequence[Lora]) -> None:
+        self._base, self._loras = base, loras
+        for lora in loras:
+            lora.check({name.removesuffix(".weight"): base.shape(name) for name in lora.targets(base.names)})
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        return self._base.shape(name)
+
+    def __getitem__(self, name: str) -> Array:
+        weight = self._base[name]
+        for lora in self._loras:
+            delta = lora.delta(name.removesuffix(".weight"))
+            if delta is not None and name.endswith(".weight"):
+                weight = weight + delta
+        return weight
+
+
+def read_config(path: Path) -> dict[str, object]:
+    """A JSON object from disk; InputError where there is none."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"Cannot read {path}: {error}.") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path} holds no settings.")
+    return document
+
+
+def _shards(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    indices = sorted(path.glob(f"*{INDEX}"))
+    if indices:
+        places = read_config(indices[0]).get("weight_map")
+        names = sorted(set(places.values())) if isinstance(places, dict) else []
+        missing = [name for name in names if not (path / name).is_file()]
+        if missing:
+            raise InputError(f"{path} lacks {len(missing)} of its {len(names)} shards, such as {missing[0]}.")
+        return [path / name for name in names]
+    files = sorted(path.glob("*.safetensors"))
+    if len(files) != 1:
+        raise InputError(f"{path} should hold one safetensors file or an index of several; it holds {len(files)}.")
+    return files
+
+
+def _keys(file: Path) -> list[str]:
+    try:
+        with safe_open(file, framework="pt") as tensors:
+            return list(tensors.keys())
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{file} is cut short or is no safetensors file: {error}.") from error
+
+
+def _plain(key: str) -> str:
+    for old, new in RENAMED:
+        if key.startswith(old):
+            return new + key.removeprefix(old)
+    return key
