@@ -165,11 +165,18 @@ def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
         fits = array.dtype == tensor.dtype and array.ndim == len(tensor.shape)
         for side, size in zip(tensor.shape, array.shape, strict=False):
             fits &= size == (side if isinstance(side, int) else sides.setdefault(side, size))
+            fits &= size > 0 and size % _multiple(side) == 0
         if not fits:
             raise InputError(
                 f"The network's input {tensor.name!r} expects {tensor.dtype} {_shape(tensor.shape, sides)} "
                 f"and got {array.dtype} {_shape(array.shape, {})}."
             )
+
+
+def _multiple(side: int | str) -> int:
+    """Of what a side must be a multiple: 4 for the side "4*rows"."""
+    factor, star, _ = str(side).partition("*")
+    return int(factor) if star and factor.isdecimal() else 1
 
 
 def _open_tested(bundle: Bundle, graph: str, device: str, threads: int | None, reason: str = "") -> Engine:
@@ -215,12 +222,14 @@ def _open_session(model: Path, device: str, threads: int | None) -> ort.Inferenc
     if name == "dml":  # DirectML's provider demands both
         options.enable_mem_pattern = False
         options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    chosen = {provider.choice: choice} if choice else {}
+    providers = [(provider.ort_name, {**provider.options, **({provider.choice: choice} if choice else {})})]
+    if name != "cpu":  # it takes the operations that an accelerator lacks
+        providers.append((PROVIDERS["cpu"].ort_name, {}))
     try:
         session = ort.InferenceSession(
             model,
             options,
-            providers=[(provider.ort_name, {**provider.options, **chosen}), "CPUExecutionProvider"],
+            providers=providers,
             enable_fallback=0,
         )
     except (ort_state.InvalidProtobuf, ort_state.InvalidGraph, ort_state.NoSuchFile) as error:

@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 
 from dior_rt.bundle import Bundle
-from dior_rt.engine import open_engine
+from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError
 from dior_rt.kernels import Strokes
 from dior_rt.sampler import Array, Condition, Velocity
@@ -39,13 +39,18 @@ class Mini:
         self.engine = open_engine(bundle, "velocity", device, threads)
 
     def bind(self, condition: Condition) -> Velocity:
-        """The network's velocity under a condition, whose arrays go to the device once."""
-        binding = self.engine.bind(condition)
+        """The network's velocity under a condition."""
+        return bind(self.engine, condition)
 
-        def velocity(x: Array, sigma: float) -> Array:
-            return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
 
-        return velocity
+def bind(engine: Engine, condition: Condition) -> Velocity:
+    """The velocity of mini's graph under a condition, whose arrays go to the device once."""
+    binding = engine.bind(condition)
+
+    def velocity(x: Array, sigma: float) -> Array:
+        return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
+
+    return velocity
 
 
 def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:

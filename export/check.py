@@ -1,0 +1,112 @@
+"""Parity: what an exported mini computes, against torch. Over a bar the export fails; figures are kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import Final
+
+import numpy as np
+import torch
+from dior_rt.kernels import Strokes
+
+from dior_rt.engine import Engine, Feeds
+from dior_rt.errors import DiorError
+from dior_rt.family import mini
+from dior_rt.sampler import Array, Condition, Velocity, draw_noise, guided, sample
+
+EVALUATION_BAR: Final = 1e-4  # largest error of one evaluation, relative to the output's largest value
+SAMPLING_BAR: Final = 60.0  # dB, after all steps
+
+SIGMAS: Final = (1.0, 0.9, 0.5, 0.1, 1e-3)
+SIZES: Final = ((64, 64), (52, 80), (4, 256), (4, 4))
+SEEDS: Final = (0, 1, 2)
+# How many units of the data variable span black to white.
+SPAN: Final[dict[mini.Mode, float]] = {"relight": 4.0, "estimate": 2.0}
+
+Bind = Callable[[Condition], Velocity]
+
+
+class ExportError(DiorError):
+    """A checkpoint that cannot be exported, or an export that computes something else than its source."""
+
+
+def check_evaluations(network: torch.nn.Module, engine: Engine) -> float:
+    """The largest relative error of one evaluation, over sigmas, sizes, modes, seeds and hostile inputs."""
+    worst = 0.0
+    for feeds in _all_feeds():
+        want, got = evaluate(network, feeds), engine.run(feeds)["velocity"]
+        worst = max(worst, float(np.abs(got - want).max() / np.abs(want).max()))
+    if not worst <= EVALUATION_BAR:
+        raise ExportError(
+            f"The graph is off by {worst:.2g} of its largest value; {EVALUATION_BAR:g} is allowed."
+        )
+    return worst
+
+
+def check_sampling(network: torch.nn.Module, bind: Bind, sigmas: Array, guidance: float) -> float:
+    """The lowest PSNR, in dB, between whole runs of the runtime's sampler over the graph and over torch."""
+    lowest = math.inf
+    for (height, width), mode in product(SIZES[:2], SPAN):
+        condition = random_condition(height, width, mode, seed=height)
+        error = _run(bind, condition, sigmas, guidance) - _run(_bind(network), condition, sigmas, guidance)
+        mean_square = float(np.mean(np.square(error / SPAN[mode], dtype=np.float64)))
+        lowest = min(lowest, -10 * math.log10(max(mean_square, 1e-20)))
+    if not lowest >= SAMPLING_BAR:
+        raise ExportError(
+            f"After all steps the graph keeps {lowest:.1f} dB to torch; it needs {SAMPLING_BAR:g}."
+        )
+    return lowest
+
+
+def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:
+    """The network's velocity in torch, as an array."""
+    with torch.inference_mode():
+        return network(**{name: torch.from_numpy(array) for name, array in feeds.items()}).numpy()
+
+
+def random_condition(height: int, width: int, mode: mini.Mode, seed: int) -> Condition:
+    """A noisy photo with strokes of light up to about 5 over a fifth of it."""
+    rng = np.random.default_rng(seed)
+    photo = rng.random((height, width, 3), dtype=np.float32)
+    light = rng.exponential(1.0, (height, width, 3)).astype(np.float32)
+    mask = (rng.random((height, width)) < 0.2).astype(np.float32)
+    return mini.encode(photo, Strokes(light, mask), mode)
+
+
+def random_feeds(height: int, width: int, seed: int) -> Feeds:
+    """Inputs of one evaluation: a batch of both modes at every one of SIGMAS."""
+    cases = list(product(SPAN, SIGMAS))
+    rows = [random_condition(height, width, mode, seed * len(cases) + i) for i, (mode, _) in enumerate(cases)]
+    condition = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    sigma = np.array([sigma for _, sigma in cases], np.float32)
+    return {"x": draw_noise(seed, condition["photo"].shape), "sigma": sigma, **condition}
+
+
+def _all_feeds() -> Iterator[Feeds]:
+    for (height, width), seed in product(SIZES, SEEDS):
+        yield random_feeds(height, width, seed)
+    usual = random_feeds(16, 16, seed=0)
+    black, bare = np.zeros_like(usual["photo"]), np.zeros_like(usual["mask"])
+    yield {**usual, "mask": bare, "light": black}
+    yield {**usual, "mask": bare + 1}
+    yield {**usual, "mask": bare + 1, "light": black + 1e4}
+    yield {**usual, "photo": black, "mask": bare + 1, "light": black}
+    yield {**usual, "x": black, "photo": black, "mask": bare, "light": black}
+    yield {**usual, "x": 100 * usual["x"]}
+
+
+def _run(bind: Bind, condition: Condition, sigmas: Array, guidance: float) -> Array:
+    noise = draw_noise(1, condition["photo"].shape)
+    *_, last = sample(guided(bind, condition, mini.null(condition), guidance), noise, sigmas)
+    return last.x
+
+
+def _bind(network: torch.nn.Module) -> Bind:
+    def bind(condition: Condition) -> Velocity:
+        return lambda x, sigma: evaluate(
+            network, {"x": x, "sigma": np.full(len(x), sigma, np.float32), **condition}
+        )
+
+    return bind

@@ -1,0 +1,30 @@
+"""A LoRA merged into the weights it was trained on: W + (alpha / rank) B A. Nothing else of it remains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+import torch
+from peft import PeftConfig, PeftModel, set_peft_model_state_dict
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+
+from dior_rt.errors import InputError
+
+
+def merge_lora(network: torch.nn.Module, folder: Path) -> torch.nn.Module:
+    """The network with peft's adapter in `folder` (adapter_config.json, adapter_model.safetensors) merged in.
+
+    Raises InputError for an adapter that is missing, cut short, or made for another network.
+    """
+    try:
+        weights = load_file(folder / "adapter_model.safetensors")
+        adapted = PeftModel(network, PeftConfig.from_pretrained(str(folder)))
+        missing, unexpected = cast(tuple[list[str], list[str]], set_peft_model_state_dict(adapted, weights))
+        strange = [*unexpected, *(key for key in missing if "lora_" in key)]
+        if strange:
+            raise ValueError(f"the network and the adapter differ in {strange[0]}")
+        return adapted.merge_and_unload(safe_merge=True)
+    except (OSError, SafetensorError, ValueError, RuntimeError, TypeError, KeyError) as error:
+        raise InputError(f"The LoRA in {folder} cannot be merged: {error}.") from error

@@ -1,0 +1,173 @@
+"""Mini to a bundle: torch's network becomes one ONNX graph, with its weights stored small, held to torch."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import tempfile
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+import onnx
+import onnx_ir
+import torch
+from dior_rt.export.check import ExportError, check_evaluations, check_sampling, evaluate, random_feeds
+from onnx import TensorProto, helper, numpy_helper
+from onnx_ir.passes.common import ClearMetadataAndDocStringPass
+from torch.export import Dim
+
+from dior_rt.bundle import Bundle, Graph, Manifest, write_bundle
+from dior_rt.engine import Engine
+from dior_rt.family import mini
+from dior_rt.grid import GridRule
+from dior_rt.schedule import ShiftSchedule
+
+Weights = Literal["fp16", "fp32"]
+
+GRAPH: Final = "model.onnx"
+PROBE: Final = "probe.npz"
+LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothing
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a network wants to be run; the fields are the manifest's."""
+
+    name: str
+    grid: GridRule
+    schedule: ShiftSchedule
+    steps: int
+    guidance: float
+    noise_scale: float
+
+
+def export_network(
+    network: torch.nn.Module, recipe: Recipe, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
+) -> Bundle:
+    """Write a network's bundle at `out`. Its inputs and output are those of mini in docs/contracts.md.
+
+    weights: how they are stored; the graph computes in float32 either way. Raises ExportError where the graph
+    computes something else than torch with the same weights, and BundleError where nothing can be written.
+    """
+    network = network.eval()
+    parity = {}
+    if weights == "fp16":
+        parity["weights_as_fp16"] = round_to_half(network, recipe.grid)
+    with tempfile.TemporaryDirectory() as scratch:
+        graph, probe = Path(scratch) / GRAPH, Path(scratch) / PROBE
+        convert(network, graph, recipe.grid.multiple)
+        if weights == "fp16":
+            store_as_half(graph)
+        onnx.checker.check_model(graph, full_check=True)
+        engine = Engine(graph)
+        parity["evaluation"] = check_evaluations(network, engine)
+        sigmas = recipe.schedule.sigmas(recipe.steps)
+        parity["sampling_db"] = check_sampling(network, partial(mini.bind, engine), sigmas, recipe.guidance)
+        save_probe(network, probe, recipe.grid)
+        manifest = describe(recipe, engine, weights, parity)
+        return write_bundle(out, manifest, {GRAPH: graph, PROBE: probe}, overwrite=overwrite)
+
+
+def convert(network: torch.nn.Module, path: Path, multiple: int) -> None:
+    """Write the network as one portable ONNX graph, optimised, with its weights inside.
+
+    Batch, rows and columns are free; sides are multiples of `multiple`. Raises ExportError.
+    """
+    batch = Dim("batch", max=64)
+    planes = {0: batch, 2: multiple * Dim("rows", max=256), 3: multiple * Dim("columns", max=256)}
+    feeds = random_feeds(4 * multiple, 6 * multiple, seed=0)
+    shapes = {name: planes if array.ndim == 4 else {0: batch} for name, array in feeds.items()}
+    with _quiet():
+        try:
+            program = torch.onnx.export(
+                network,
+                kwargs={name: torch.from_numpy(array) for name, array in feeds.items()},
+                dynamic_shapes=shapes,
+                input_names=list(feeds),
+                output_names=["velocity"],
+                dynamo=True,
+                optimize=True,
+                verbose=False,
+            )
+        except (torch.onnx.OnnxExporterError, RuntimeError, ValueError) as error:
+            raise ExportError(f"The network cannot be written as an ONNX graph: {error}.") from error
+    assert program is not None  # only the old exporter returns None
+    ClearMetadataAndDocStringPass()(program.model)  # it names the source files of this machine
+    onnx_ir.save(program.model, path)
+
+
+def round_to_half(network: torch.nn.Module, grid: GridRule) -> float:
+    """Round the large weights to what float16 can hold, in place.
+
+    Returns what that costs: the largest change of an evaluation, relative to its largest value.
+    """
+    feeds = random_feeds(*grid.shape(1, 1), seed=0)
+    before = evaluate(network, feeds)
+    for weight in network.parameters():
+        if weight.numel() >= LARGE:
+            weight.data = weight.data.half().float()
+    after = evaluate(network, feeds)
+    return float(np.abs(after - before).max() / np.abs(before).max())
+
+
+def store_as_half(path: Path) -> None:
+    """Store the large weights of a graph as float16 wherever that loses nothing, and cast them on loading."""
+    model = onnx.load(path)
+    casts = []
+    for tensor in model.graph.initializer:
+        weight = numpy_helper.to_array(tensor)
+        with np.errstate(over="ignore"):
+            half = weight.astype(np.float16)
+        if weight.dtype == np.float32 and weight.size >= LARGE and np.array_equal(half, weight):
+            name = tensor.name
+            tensor.CopyFrom(numpy_helper.from_array(half, f"{name}.half"))
+            casts.append(helper.make_node("Cast", [tensor.name], [name], to=TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    onnx.save(model, path)
+
+
+def save_probe(network: torch.nn.Module, path: Path, grid: GridRule) -> None:
+    """The bundle's self-test: one small evaluation, and what torch answers."""
+    feeds = random_feeds(2 * grid.multiple, 3 * grid.multiple, seed=1)
+    np.savez(path, **feeds, velocity=evaluate(network, feeds))
+
+
+def describe(recipe: Recipe, engine: Engine, weights: Weights, parity: dict[str, float]) -> Manifest:
+    """The manifest of an exported network."""
+    return Manifest(
+        family="mini",
+        name=recipe.name,
+        licence="Apache-2.0",
+        precision=weights,
+        files={},
+        graphs={"velocity": Graph(GRAPH, engine.inputs, engine.outputs, PROBE)},
+        schedule=recipe.schedule,
+        steps=recipe.steps,
+        guidance=recipe.guidance,
+        colour="srgb",
+        grid=recipe.grid,
+        noise_scale=recipe.noise_scale,
+        parity=parity,
+        settings={},
+    )
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """torch.onnx speaks of packages that are not needed and of its own deprecations."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
