@@ -48,7 +48,7 @@ def rgb_profile(space: tuple, curve: bytes) -> bytes:
 
 
 def table_profile(kind: bytes, curve: np.ndarray, corners: np.ndarray) -> bytes:
-    """A profile whose light comes from a table (lut16Type): a curve a channel, then a cube of 2 ** n corners in XYZ."""
+    """A profile made of a table (lut16Type): a curve a channel, then a cube of 2 ** n corners in XYZ."""
     channels = int(np.log2(len(corners)))
     head = struct.pack(
         ">4sI4B9i", b"mft2", 0, channels, 3, 2, 0, *(65536 * v for v in (1, 0, 0, 0, 1, 0, 0, 0, 1))
