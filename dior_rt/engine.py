@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import onnxruntime as ort
@@ -45,7 +46,8 @@ _ORT_ERRORS: tuple[type[Exception], ...] = (
 class Provider:
     """An execution provider of ONNX Runtime.
 
-    ort_name: its name there. options: what keeps it in float32. choice: the option that picks a device.
+    ort_name: its name there. options: what keeps it in float32. choice: the option that picks one of its
+    devices, if there is one.
     """
 
     ort_name: str
@@ -61,7 +63,7 @@ PROVIDERS = {
     "coreml": Provider("CoreMLExecutionProvider", {"ModelFormat": "MLProgram"}, choice="MLComputeUnits"),
     "webgpu": Provider("WebGpuExecutionProvider"),
     "openvino": Provider("OpenVINOExecutionProvider", {"precision": "FP32"}, choice="device_type"),
-    "cpu": Provider("CPUExecutionProvider"),
+    "cpu": Provider("CPUExecutionProvider", choice=""),
 }
 
 
@@ -161,15 +163,16 @@ def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
         raise InputError(f"The network expects {sorted(expected)} and got {sorted(feeds)}.")
     sides: dict[str, int] = {}
     for tensor in inputs:
-        array = feeds[tensor.name]
+        array, known = feeds[tensor.name], dict(sides)
         fits = array.dtype == tensor.dtype and array.ndim == len(tensor.shape)
         for side, size in zip(tensor.shape, array.shape, strict=False):
             fits &= size == (side if isinstance(side, int) else sides.setdefault(side, size))
             fits &= size > 0 and size % _multiple(side) == 0
         if not fits:
+            shape = [known.get(side, side) if isinstance(side, str) else side for side in tensor.shape]
             raise InputError(
-                f"The network's input {tensor.name!r} expects {tensor.dtype} {_shape(tensor.shape, sides)} "
-                f"and got {array.dtype} {_shape(array.shape, {})}."
+                f"The network's input {tensor.name!r} expects {tensor.dtype} {_by(shape)} "
+                f"and got {array.dtype} {_by(array.shape)}."
             )
 
 
@@ -197,7 +200,7 @@ def _self_test(engine: Engine, probe: Path) -> None:
         with np.load(probe, allow_pickle=False) as arrays:
             feeds = {tensor.name: arrays[tensor.name] for tensor in engine.inputs}
             wanted = {tensor.name: arrays[tensor.name] for tensor in engine.outputs}
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise BundleError(f"Cannot read the self-test {probe}: {error}.") from error
     for name, got in engine.run(feeds).items():
         want = wanted[name]
@@ -210,7 +213,7 @@ def _self_test(engine: Engine, probe: Path) -> None:
 
 def _open_session(model: Path, device: str, threads: int | None) -> ort.InferenceSession:
     name, _, choice = device.partition(":")
-    if name not in available():
+    if name not in available() or (choice and not PROVIDERS[name].choice):
         raise DeviceError(f"There is no device {device!r} here; there is {', '.join(available())}, or auto.")
     provider = PROVIDERS[name]
     options = ort.SessionOptions()
@@ -232,12 +235,10 @@ def _open_session(model: Path, device: str, threads: int | None) -> ort.Inferenc
             providers=providers,
             enable_fallback=0,
         )
-    except (ort_state.InvalidProtobuf, ort_state.InvalidGraph, ort_state.NoSuchFile) as error:
-        raise BundleError(
-            f"{model} is no ONNX graph that this ONNX Runtime reads: {_first_line(error)}"
-        ) from error
     except _ORT_ERRORS as error:
-        raise DeviceError(f"{device} cannot load {model}: {_first_line(error)}") from error
+        # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
+        kind = BundleError if name == "cpu" else DeviceError
+        raise kind(f"{device} cannot load {model}: {_first_line(error)}") from error
     if session.get_providers()[0] != provider.ort_name:
         raise DeviceError(f"{device} could not be started; ONNX Runtime fell back to the CPU.")
     return session
@@ -259,5 +260,5 @@ def _tensor(node: ort.NodeArg) -> Tensor:
     return Tensor(node.name, _DTYPES.get(node.type, node.type), tuple(node.shape))
 
 
-def _shape(shape: tuple[int | str, ...], sides: Mapping[str, int]) -> str:
-    return "x".join(str(sides.get(side, side) if isinstance(side, str) else side) for side in shape)
+def _by(shape: Sequence[int | str]) -> str:
+    return " x ".join(map(str, shape)) or "scalar"
