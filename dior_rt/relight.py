@@ -1,12 +1,4 @@
-"""Relight a photo: the way of a picture from pixels to pixels. Load once, relight many.
-
-from PIL import Image
-from dior_rt import Relighter
-
-relighter = Relighter()
-relit = relighter.relight(Image.open("photo.jpg"), Image.open("strokes.png"))
-relit.picture.save("relit.png")
-"""
+"""Relight a photo: the way of a picture from pixels to pixels."""
 
 from __future__ import annotations
 
@@ -15,16 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dior_rt.bundle import MOST_STEPS, default_bundle, read_bundle
-from dior_rt.errors import Cancelled, DeviceError, InputError
-from dior_rt.family import mini
+from dior_rt.bundle import MOST_STEPS, Bundle, default_bundle, read_bundle
+from dior_rt.errors import BundleError, Cancelled, DeviceError, InputError
+from dior_rt.family import Family
+from dior_rt.family.mini import Mini
 from dior_rt.kernels import KernelError, Strokes, open_ops
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
-from dior_rt.sampler import Array, Condition, draw_noise, guided, sample
+from dior_rt.sampler import Array, draw_noise, sample
 
 Progress = Callable[[int, int], bool | None]
 
@@ -49,7 +43,11 @@ class Relit:
 
 
 class Relighter:
-    """A model on a device. Safe to use from several threads.
+    """A model on a device: load once, relight many. Safe to use from several threads.
+
+        relighter = Relighter()
+        relit = relighter.relight(Image.open("photo.jpg"), Image.open("strokes.png"))
+        relit.picture.save("relit.png")
 
     device, ops: what runs the network and the pixel kernels; device_reason, ops_reason: why these.
     """
@@ -68,12 +66,12 @@ class Relighter:
         there or computes wrong results.
         """
         self.bundle = read_bundle(Path(bundle) if bundle else default_bundle())
-        self._network = mini.Mini(self.bundle, device, threads)
+        self._family = open_family(self.bundle, device, threads)
         try:
             self._ops = open_ops(ops)
         except KernelError as error:
             raise DeviceError(str(error)) from error
-        self.device, self.device_reason = self._network.engine.device, self._network.engine.reason
+        self.device, self.device_reason = self._family.device, self._family.reason
         self.ops, self.ops_reason = self._ops.name, self._ops.reason
 
     def relight(
@@ -103,15 +101,16 @@ class Relighter:
         _check_settings(steps, guidance, seed, intensity)
         watch = Stopwatch()
         pixels = read_pixels(photo)
-        grid = self._network.grid.shape(*pixels.shape[:2])
-        drawn = self._reduce_strokes(strokes, pixels.shape[:2], grid, intensity)
+        raster = self._family.raster(*pixels.shape[:2])
+        drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
         if not drawn.mask.any():
             return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, steps, guidance, seed, intensity)
-        source, encoded = self._reduce_photo(pixels, grid)
+        source, encoded = self._reduce_photo(pixels, raster)
         watch.lap("kernels")
-        x0 = self._sample(mini.encode(encoded, drawn, "relight"), steps, guidance, seed, progress)
+        condition = self._family.encode(encoded, drawn, "relight")
+        x0 = self._sample(condition, steps, guidance, seed, progress)
         watch.lap("steps")
-        relit = self._ops.decode_srgb(mini.decode_relit(x0, encoded))
+        relit = self._ops.decode_srgb(self._family.decode_relit(x0, condition))
         picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
         watch.lap("transfer")
         return Relit(picture, None, watch.seconds, steps, guidance, seed, intensity)
@@ -126,23 +125,22 @@ class Relighter:
         steps = self.bundle.manifest.steps if steps is None else steps
         _check_settings(steps, 1.0, seed, 1.0)
         pixels = read_pixels(photo)
-        _, encoded = self._reduce_photo(pixels, self._network.grid.shape(*pixels.shape[:2]))
-        return mini.decode_lumi(
-            self._sample(mini.encode(encoded, None, "estimate"), steps, 1.0, seed, progress)
-        )
+        _, encoded = self._reduce_photo(pixels, self._family.raster(*pixels.shape[:2]))
+        condition = self._family.encode(encoded, None, "estimate")
+        return self._family.decode_lumi(self._sample(condition, steps, 1.0, seed, progress), condition)
 
-    def _reduce_photo(self, pixels: NDArray, grid: tuple[int, int]) -> tuple[Array, Array]:
-        """The photo's light grid, linear and sRGB-encoded."""
-        source = self._ops.reduce_photo(pixels, grid)
+    def _reduce_photo(self, pixels: NDArray, raster: tuple[int, int]) -> tuple[Array, Array]:
+        """The photo on its light grid, linear and sRGB-encoded 0..1."""
+        source = self._ops.reduce_photo(pixels, raster)
         return source, np.clip(self._ops.encode_srgb(source, np.float32), 0, 1)
 
     def _reduce_strokes(
-        self, strokes: Strokes | Picture, size: tuple[int, int], grid: tuple[int, int], intensity: float
+        self, strokes: Strokes | Picture, size: tuple[int, int], raster: tuple[int, int], intensity: float
     ) -> Strokes:
         light, mask = read_strokes(strokes)
-        if mask.shape != grid:
+        if mask.shape != raster:
             check_same_shape(mask.shape, size)
-        drawn = self._ops.reduce_strokes(light, mask, grid)
+        drawn = self._ops.reduce_strokes(light, mask, raster)
         with np.errstate(over="ignore"):
             drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
         if not np.isfinite(drawn.light).all():
@@ -150,12 +148,14 @@ class Relighter:
         return drawn
 
     def _sample(
-        self, condition: Condition, steps: int, guidance: float, seed: int, progress: Progress | None
+        self, condition: Any, steps: int, guidance: float, seed: int, progress: Progress | None
     ) -> Array:
-        """The state at the end of the flow, (1, 3, h, w)."""
-        noise = np.float32(self.bundle.manifest.noise_scale) * draw_noise(seed, condition["photo"].shape)
-        velocity = guided(self._network.bind, condition, mini.null(condition), guidance)
-        for state in sample(velocity, noise, self._network.schedule.sigmas(steps)):
+        """The state at the end of the flow."""
+        family = self._family
+        sigmas = family.sigmas(steps, condition)
+        noise = draw_noise(seed, family.noise_shape(condition))
+        noise *= np.float32(self.bundle.manifest.noise_scale)
+        for state in sample(family.velocity(condition, sigmas, guidance), noise, sigmas):
             if progress and progress(state.step, state.steps) is False:
                 raise Cancelled(f"Stopped after step {state.step} of {state.steps}.")
         return state.x
@@ -172,6 +172,13 @@ class Stopwatch:
         """Book the time since the last lap on `stage`."""
         now = perf_counter()
         self.seconds[stage], self._last = now - self._last, now
+
+
+def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:
+    """Load a bundle's networks; raises what its family raises."""
+    if bundle.manifest.family == "mini":
+        return Mini(bundle, device, threads)
+    raise BundleError(f"This dior-rt cannot run the family {bundle.manifest.family}.")
 
 
 def _check_settings(steps: int, guidance: float, seed: int, intensity: float) -> None:

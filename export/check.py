@@ -13,7 +13,7 @@ from dior_rt.kernels import Strokes
 
 from dior_rt.engine import Engine, Feeds
 from dior_rt.errors import DiorError
-from dior_rt.family import mini
+from dior_rt.family import Mode, mini
 from dior_rt.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 
 EVALUATION_BAR: Final = 1e-4  # largest error of one evaluation, relative to the output's largest value
@@ -23,7 +23,7 @@ SIGMAS: Final = (1.0, 0.9, 0.5, 0.1, 1e-3)
 SIZES: Final = ((64, 64), (52, 80), (4, 256), (4, 4))
 SEEDS: Final = (0, 1, 2)
 # How many units of the data variable span black to white.
-SPAN: Final[dict[mini.Mode, float]] = {"relight": 4.0, "estimate": 2.0}
+SPAN: Final[dict[Mode, float]] = {"relight": 4.0, "estimate": 2.0}
 
 Bind = Callable[[Condition], Velocity]
 
@@ -66,7 +66,7 @@ def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:
         return network(**{name: torch.from_numpy(array) for name, array in feeds.items()}).numpy()
 
 
-def random_condition(height: int, width: int, mode: mini.Mode, seed: int) -> Condition:
+def random_condition(height: int, width: int, mode: Mode, seed: int) -> Condition:
     """A noisy photo with strokes of light up to about 5 over a fifth of it."""
     rng = np.random.default_rng(seed)
     photo = rng.random((height, width, 3), dtype=np.float32)

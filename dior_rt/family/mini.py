@@ -6,41 +6,74 @@ and photo are sRGB-encoded and encode(L) = log(1 + 8 L) / log 9: in both, square
 
 from __future__ import annotations
 
-from typing import Final, Literal
+from functools import partial
+from typing import Final
 
 import numpy as np
 
 from dior_rt.bundle import Bundle
 from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError
+from dior_rt.family import Mode
 from dior_rt.kernels import Strokes
-from dior_rt.sampler import Array, Condition, Velocity
+from dior_rt.sampler import Array, Condition, Velocity, guided
 from dior_rt.schedule import ShiftSchedule
 
-Mode = Literal["relight", "estimate"]
-MODES: Final = {"relight": 0, "estimate": 1}
+MODES: Final[dict[Mode, int]] = {"relight": 0, "estimate": 1}
 RELIT_SCALE: Final = np.float32(4)
 LUMI_SCALE: Final = np.float32(8)
 
 
 class Mini:
-    """A mini bundle, loaded on a device. Safe to use from several threads."""
+    """A mini bundle, loaded on a device: the `Family` whose condition is the network's inputs, by name."""
 
     def __init__(self, bundle: Bundle, device: str = "auto", threads: int | None = None) -> None:
-        """Raises BundleError for a bundle that is no mini, and what `open_engine` raises."""
-        manifest = bundle.manifest
-        if (
-            manifest.family != "mini"
-            or manifest.grid is None
-            or not isinstance(manifest.schedule, ShiftSchedule)
-        ):
+        """Raises BundleError for a bundle that is no complete mini, and what `open_engine` raises."""
+        grid, schedule = bundle.manifest.grid, bundle.manifest.schedule
+        if bundle.manifest.family != "mini" or grid is None or not isinstance(schedule, ShiftSchedule):
             raise BundleError(f"{bundle.folder} is no complete bundle of the family mini.")
-        self.manifest, self.grid, self.schedule = manifest, manifest.grid, manifest.schedule
-        self.engine = open_engine(bundle, "velocity", device, threads)
+        self._grid, self._schedule = grid, schedule
+        self._engine = open_engine(bundle, "velocity", device, threads)
+        self.device, self.reason = self._engine.device, self._engine.reason
 
-    def bind(self, condition: Condition) -> Velocity:
-        """The network's velocity under a condition."""
-        return bind(self.engine, condition)
+    def raster(self, height: int, width: int) -> tuple[int, int]:
+        return self._grid.shape(height, width)
+
+    def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
+        return encode(photo, strokes, mode)
+
+    def noise_shape(self, condition: Condition) -> tuple[int, ...]:
+        return condition["photo"].shape
+
+    def sigmas(self, steps: int, condition: Condition) -> Array:
+        return self._schedule.sigmas(steps)
+
+    def velocity(self, condition: Condition, sigmas: Array, guidance: float) -> Velocity:
+        return guided(partial(bind, self._engine), condition, null(condition), guidance)
+
+    def decode_relit(self, x0: Array, condition: Condition) -> Array:
+        return _pixels(np.clip(condition["photo"] + x0 / RELIT_SCALE, 0, 1))
+
+    def decode_lumi(self, x0: Array, condition: Condition) -> Array:
+        encoded = np.maximum((_pixels(x0) + 1) / 2, 0)
+        return np.expm1(encoded * np.log1p(LUMI_SCALE)) / LUMI_SCALE
+
+
+def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
+    """The network's inputs for one photo (h, w, 3), sRGB 0..1, and strokes of the same grid, or None."""
+    nothing = Strokes(np.zeros_like(photo), np.zeros(photo.shape[:2], np.float32))
+    strokes = strokes or nothing
+    return {
+        "photo": _planes(photo),
+        "light": _planes(np.where(strokes.mask[..., None] > 0, strokes.light, 0)),
+        "mask": _planes(strokes.mask[..., None]),
+        "mode": np.array([MODES[mode]], np.int64),
+    }
+
+
+def null(condition: Condition) -> Condition:
+    """The condition without its strokes: the null branch of guidance."""
+    return {**condition, **{name: np.zeros_like(condition[name]) for name in ("light", "mask")}}
 
 
 def bind(engine: Engine, condition: Condition) -> Velocity:
@@ -51,39 +84,6 @@ def bind(engine: Engine, condition: Condition) -> Velocity:
         return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
 
     return velocity
-
-
-def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
-    """The network's inputs for one picture.
-
-    photo: (h, w, 3) sRGB-encoded grid, 0..1. strokes: of the same grid, or None for none.
-    """
-    height, width = photo.shape[:2]
-    specified = np.zeros((height, width), np.float32) if strokes is None else strokes.mask
-    light = np.zeros_like(photo) if strokes is None else strokes.light
-    return {
-        "photo": _planes(photo),
-        "light": _planes(light * (specified > 0)[..., None]),
-        "mask": _planes(specified[..., None]),
-        "mode": np.array([MODES[mode]], np.int64),
-    }
-
-
-def null(condition: Condition) -> Condition:
-    """The condition without its strokes: the null branch of guidance."""
-    nothing = {name: np.zeros_like(condition[name]) for name in ("light", "mask")}
-    return {**condition, **nothing}
-
-
-def decode_relit(x0: Array, photo: Array) -> Array:
-    """(1, 3, h, w) state -> the relit grid (h, w, 3), sRGB-encoded 0..1: clip(photo + x0 / 4)."""
-    return np.clip(photo + _pixels(x0) / RELIT_SCALE, 0, 1)
-
-
-def decode_lumi(x0: Array) -> Array:
-    """(1, 3, h, w) state -> the Lumi map of the grid (h, w, 3), linear >= 0: encode's inverse."""
-    encoded = np.maximum((_pixels(x0) + 1) / 2, 0)
-    return np.expm1(encoded * np.log1p(LUMI_SCALE)) / LUMI_SCALE
 
 
 def _planes(pixels: Array) -> Array:
