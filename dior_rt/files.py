@@ -68,4 +68,5 @@ def check_readable(path: Path, what: str) -> None:
 def reason(error: BaseException) -> str:
     """What a library's error says, as the end of a sentence: its first line, without a full stop."""
     text = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
-    return (text[:1].lower() + text[1:]).rstrip(".") if text[1:2].islower() else text.rstrip(".")
+    starts_as_a_sentence = text.partition(" ")[0][1:].islower()
+    return (text[:1].lower() + text[1:] if starts_as_a_sentence else text).rstrip(".")
