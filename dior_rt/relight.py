@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,11 +16,13 @@ from dior_rt.bundle import MOST_STEPS, Bundle, default_bundle, read_bundle
 from dior_rt.errors import BundleError, Cancelled, DeviceError, InputError
 from dior_rt.family import Family
 from dior_rt.family.mini import Mini
-from dior_rt.kernels import KernelError, Strokes, open_ops
+from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.sampler import Array, draw_noise, sample
 
 Progress = Callable[[int, int], bool | None]
+
+CANVAS = 2048  # pixels of the longest side on which strokes given as lines are drawn
 
 NOTHING_DRAWN = "The strokes specify nothing, so the photo is unchanged."
 
@@ -77,7 +79,7 @@ class Relighter:
     def relight(
         self,
         photo: Picture,
-        strokes: Strokes | Picture,
+        strokes: Strokes | Sequence[Stroke] | Picture,
         *,
         steps: int | None = None,
         guidance: float | None = None,
@@ -89,7 +91,8 @@ class Relighter:
 
         photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
         strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
-        sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size.
+        sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
+        Stroke, in pixels of the photo.
         steps, guidance: None takes the model's own. intensity: multiplies the light, >= 0.
         progress: called after each step with (step, steps); returning False stops with Cancelled.
 
@@ -135,8 +138,14 @@ class Relighter:
         return source, np.clip(self._ops.encode_srgb(source, np.float32), 0, 1)
 
     def _reduce_strokes(
-        self, strokes: Strokes | Picture, size: tuple[int, int], raster: tuple[int, int], intensity: float
+        self,
+        strokes: Strokes | Sequence[Stroke] | Picture,
+        size: tuple[int, int],
+        raster: tuple[int, int],
+        intensity: float,
     ) -> Strokes:
+        if isinstance(strokes, list | tuple):
+            strokes = self._draw(strokes, size)
         light, mask = read_strokes(strokes)
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
@@ -146,6 +155,21 @@ class Relighter:
         if not np.isfinite(drawn.light).all():
             raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
         return drawn
+
+    def _draw(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> Strokes:
+        # Far finer than any light grid, and bounded, however large the photo.
+        scale = min(1.0, CANVAS / max(size))
+        canvas = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+        down, across = canvas[0] / size[0], canvas[1] / size[1]
+        drawn = [
+            replace(
+                stroke,
+                points=tuple((x * across, y * down) for x, y in stroke.points),
+                width=stroke.width * scale,
+            )
+            for stroke in strokes
+        ]
+        return self._ops.draw_strokes(drawn, canvas)
 
     def _sample(
         self, condition: Any, steps: int, guidance: float, seed: int, progress: Progress | None
