@@ -20,6 +20,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final, Literal
 
 from dior_rt.errors import BundleError
+from dior_rt.files import reason
 from dior_rt.grid import GridRule
 from dior_rt.records import parse, read_json, unparse
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
@@ -148,7 +149,7 @@ def write_bundle(
     """
     folder = folder.resolve()
     try:
-        _refuse_target(folder, overwrite)
+        check_target(folder, overwrite)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
             draft = Path(scratch) / "bundle"
@@ -157,8 +158,18 @@ def write_bundle(
             read_bundle(draft)
             _move_into_place(draft, folder)
     except (OSError, ValueError) as error:
-        raise BundleError(f"Cannot write the bundle {folder}: {error}.") from error
+        raise BundleError(f"Cannot write the bundle {folder}: {reason(error)}.") from error
     return Bundle(folder, written)
+
+
+def check_target(folder: Path, overwrite: bool) -> None:
+    """BundleError where `write_bundle` would refuse the place: something is there that it may not replace."""
+    if not folder.exists() and not folder.is_symlink():
+        return
+    if not overwrite:
+        raise BundleError(f"{folder} is there already; name another place, or ask to overwrite it.")
+    if not (folder.is_dir() and (folder / MANIFEST).is_file()):
+        raise BundleError(f"{folder} is no bundle, and only a bundle is overwritten.")
 
 
 def _read_manifest(folder: Path) -> Manifest:
@@ -173,7 +184,7 @@ def _read_manifest(folder: Path) -> Manifest:
     except FileNotFoundError:
         raise BundleError(f"{folder} is no bundle: it has no {MANIFEST}.") from None
     except (OSError, ValueError) as error:
-        raise BundleError(f"Cannot read {folder / MANIFEST}: {error}.") from error
+        raise BundleError(f"Cannot read {folder / MANIFEST}: {reason(error)}.") from error
 
 
 def _check_relative(path: str) -> None:
@@ -195,21 +206,12 @@ def _check_file(folder: Path, relative: str, digest: str) -> None:
         if _sha256(path) != digest:
             raise BundleError(f"The bundle {folder} was altered: {relative!r} does not match its sha256.")
     except (OSError, ValueError) as error:
-        raise BundleError(f"Cannot read {path}: {error}.") from error
+        raise BundleError(f"Cannot read {path}: {reason(error)}.") from error
 
 
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _refuse_target(folder: Path, overwrite: bool) -> None:
-    if not folder.exists() and not folder.is_symlink():
-        return
-    if not overwrite:
-        raise BundleError(f"{folder} is there already; name another place, or ask to overwrite it.")
-    if not (folder.is_dir() and (folder / MANIFEST).is_file()):
-        raise BundleError(f"{folder} is no bundle, and only a bundle is overwritten.")
 
 
 def _fill(draft: Path, manifest: Manifest, files: Mapping[str, Path]) -> Manifest:

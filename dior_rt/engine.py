@@ -20,6 +20,7 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
 from dior_rt.bundle import Bundle, Tensor
 from dior_rt.errors import BundleError, DeviceError, InputError
+from dior_rt.files import reason
 
 Feeds = Mapping[str, NDArray]
 
@@ -201,7 +202,7 @@ def _self_test(engine: Engine, probe: Path) -> None:
             feeds = {tensor.name: arrays[tensor.name] for tensor in engine.inputs}
             wanted = {tensor.name: arrays[tensor.name] for tensor in engine.outputs}
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-        raise BundleError(f"Cannot read the self-test {probe}: {error}.") from error
+        raise BundleError(f"Cannot read the self-test {probe}: {reason(error)}.") from error
     for name, got in engine.run(feeds).items():
         want = wanted[name]
         error_here = np.abs(got - want).max() / np.abs(want).max()
@@ -238,7 +239,7 @@ def _open_session(model: Path, device: str, threads: int | None) -> ort.Inferenc
     except _ORT_ERRORS as error:
         # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
         kind = BundleError if name == "cpu" else DeviceError
-        raise kind(f"{device} cannot load {model}: {_first_line(error)}") from error
+        raise kind(f"{device} cannot load {model}: {reason(error)}.") from error
     if session.get_providers()[0] != provider.ort_name:
         raise DeviceError(f"{device} could not be started; ONNX Runtime fell back to the CPU.")
     return session
@@ -249,11 +250,7 @@ def _translated(what: str) -> Iterator[None]:
     try:
         yield
     except _ORT_ERRORS as error:
-        raise DeviceError(f"{what}: {_first_line(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
+        raise DeviceError(f"{what}: {reason(error)}.") from error
 
 
 def _tensor(node: ort.NodeArg) -> Tensor:

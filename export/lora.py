@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import cast
+from typing import Final, cast
 
 import torch
 from peft import PeftConfig, PeftModel, set_peft_model_state_dict
@@ -11,6 +11,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from dior_rt.errors import InputError
+from dior_rt.files import check_readable, reason
+
+CONFIG: Final = "adapter_config.json"
+WEIGHTS: Final = "adapter_model.safetensors"
 
 
 def merge_lora(network: torch.nn.Module, folder: Path) -> torch.nn.Module:
@@ -18,8 +22,10 @@ def merge_lora(network: torch.nn.Module, folder: Path) -> torch.nn.Module:
 
     Raises InputError for an adapter that is missing, cut short, or made for another network.
     """
+    for name in (CONFIG, WEIGHTS):  # peft would look for what is missing on the net, and for pickles
+        check_readable(folder / name, "LoRA")
     try:
-        weights = load_file(folder / "adapter_model.safetensors")
+        weights = load_file(folder / WEIGHTS)
         adapted = PeftModel(network, PeftConfig.from_pretrained(str(folder)))
         missing, unexpected = cast(tuple[list[str], list[str]], set_peft_model_state_dict(adapted, weights))
         strange = [*unexpected, *(key for key in missing if "lora_" in key)]
@@ -27,4 +33,4 @@ def merge_lora(network: torch.nn.Module, folder: Path) -> torch.nn.Module:
             raise ValueError(f"the network and the adapter differ in {strange[0]}")
         return adapted.merge_and_unload(safe_merge=True)
     except (OSError, SafetensorError, ValueError, RuntimeError, TypeError, KeyError) as error:
-        raise InputError(f"The LoRA in {folder} cannot be merged: {error}.") from error
+        raise InputError(f"The LoRA in {folder} cannot be merged: {reason(error)}.") from error

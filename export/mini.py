@@ -21,9 +21,10 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 from torch.export import Dim
 
-from dior_rt.bundle import Bundle, Graph, Manifest, write_bundle
+from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
 from dior_rt.engine import Engine
 from dior_rt.family import mini
+from dior_rt.files import reason
 from dior_rt.grid import GridRule
 from dior_rt.schedule import ShiftSchedule
 
@@ -54,6 +55,7 @@ def export_network(
     weights: how they are stored; the graph computes in float32 either way. Raises ExportError where the graph
     computes something else than torch with the same weights, and BundleError where nothing can be written.
     """
+    check_target(out, overwrite)
     network = network.eval()
     parity = {}
     if weights == "fp16":
@@ -95,7 +97,7 @@ def convert(network: torch.nn.Module, path: Path, multiple: int) -> None:
                 verbose=False,
             )
         except (torch.onnx.OnnxExporterError, RuntimeError, ValueError) as error:
-            raise ExportError(f"The network cannot be written as an ONNX graph: {error}.") from error
+            raise ExportError(f"The network cannot be written as an ONNX graph: {reason(error)}.") from error
     assert program is not None  # only the old exporter returns None
     ClearMetadataAndDocStringPass()(program.model)  # it names the source files of this machine
     onnx_ir.save(program.model, path)
