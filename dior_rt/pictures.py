@@ -82,6 +82,10 @@ class Photo:
         codes = self.curves.srgb.shape[1] if self.curves else np.iinfo(self.pixels.dtype).max + 1
         return 8 if codes == 256 else 16
 
+    def with_pixels(self, pixels: Pixels) -> Photo:
+        """The same photo with other pixels of the same shape and dtype."""
+        return replace(self, pixels=pixels)
+
 
 def read_photo(path: Path, what: str = "photo") -> Photo:
     """Read a photo; what: how an error calls it.

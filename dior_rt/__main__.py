@@ -1,0 +1,5 @@
+"""`python -m dior_rt` is `dior-rt`."""
+
+from dior_rt.cli import main
+
+main()

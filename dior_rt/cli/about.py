@@ -1,0 +1,83 @@
+"""The commands that tell what is there, and the one that makes a bundle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from dior_rt.cli import options
+from dior_rt.errors import MissingExtraError
+
+
+def info(
+    bundle: Annotated[
+        Path | None, typer.Argument(metavar="BUNDLE", help="[default: the model that ships with dior-rt]")
+    ] = None,
+    as_json: options.Json = False,
+    debug: options.Debug = False,
+) -> None:
+    """Check a bundle's files and say what is in it.
+
+    \b
+      dior-rt info
+      dior-rt info my-bundle --json
+    """
+    from dior_rt.bundle import default_bundle, read_bundle
+    from dior_rt.records import unparse
+
+    found = read_bundle(bundle or default_bundle())
+    manifest = found.manifest
+    if as_json:
+        typer.echo(json.dumps({"folder": str(found.folder), **unparse(manifest)}, indent=2))
+        return
+    megabytes = sum((found.folder / file).stat().st_size for file in manifest.files) / 1e6
+    rows = {
+        "name": manifest.name,
+        "folder": found.folder,
+        "family": manifest.family,
+        "licence": manifest.licence,
+        "weights": f"{manifest.precision}, {megabytes:.1f} MB in {len(manifest.files)} files, all unaltered",
+        "steps": manifest.steps,
+        "guidance": f"{manifest.guidance:g}",
+        "graphs": ", ".join(sorted(manifest.graphs)),
+        **{f"parity {name}": f"{value:.4g}" for name, value in manifest.parity.items()},
+    }
+    _table(list(rows.items()))
+
+
+def export(
+    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="A folder that training wrote.")],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="BUNDLE", help="The folder to make.")],
+    lora: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="A LoRA of the checkpoint, to be merged.")
+    ] = None,
+    weights: Annotated[Literal["fp16", "fp32"], typer.Option(help="How the weights are stored.")] = "fp16",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bundle at BUNDLE.")] = False,
+    debug: options.Debug = False,
+) -> None:
+    """Make a bundle of a trained checkpoint.
+
+    The LoRA is merged, the network converted to ONNX and compared with torch; where they differ, nothing is
+    written. Needs pip install 'dior-rt[export]'.
+
+    \b
+      dior-rt export runs/mini/step-9000 --lora runs/mini-lora -o bundles/mini
+    """
+    try:
+        from dior_rt.export import export_checkpoint
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("dior_rt"):
+            raise
+        raise MissingExtraError("export", "export") from error
+
+    bundle = export_checkpoint(checkpoint, out, lora=lora, weights=weights, overwrite=overwrite)
+    _table([(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()])
+
+
+def _table(rows: list[tuple[str, object]]) -> None:
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        typer.echo(f"{name:<{width}}  {value}")

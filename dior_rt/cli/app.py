@@ -1,0 +1,69 @@
+"""The commands by name. `train` is a door: what lies behind it is imported when somebody goes through."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from dior_rt import __version__
+from dior_rt.cli import about, pictures
+from dior_rt.errors import MissingExtraError
+
+app = typer.Typer(
+    name="dior-rt",
+    help="Relight a photograph from light drawn on it.",
+    epilog="dior-rt COMMAND --help explains a command, with examples.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for body in (pictures.relight, pictures.estimate, pictures.sparsify, about.info, about.export):
+    app.command()(body)
+
+
+@app.callback(invoke_without_command=True)
+def dior_rt(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Say the version and stop.")] = False,
+) -> None:
+    """Relight a photograph from light drawn on it."""
+    if version:
+        typer.echo(__version__)
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+class TrainGroup(TyperGroup):
+    """The commands of dior_rt.training.cli, imported on the first question about them."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Their names."""
+        return _training().list_commands(ctx)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One of them, or None."""
+        return _training().get_command(ctx, cmd_name)
+
+
+app.add_typer(
+    typer.Typer(cls=TrainGroup),
+    name="train",
+    help="Render scenes, train models, evaluate them.",
+)
+
+
+@cache
+def _training() -> TyperGroup:
+    try:
+        from dior_rt.training.cli import app as training
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("dior_rt"):
+            raise
+        raise MissingExtraError("train", "train") from error
+    group = typer.main.get_command(training)
+    assert isinstance(group, TyperGroup)
+    return group

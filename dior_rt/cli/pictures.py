@@ -1,0 +1,266 @@
+"""The commands that turn pictures into pictures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from dior_rt import __version__
+from dior_rt.cli import options
+from dior_rt.errors import InputError
+
+if TYPE_CHECKING:
+    from dior_rt.relight import Relighter
+
+
+def relight(
+    photo: options.Photo,
+    strokes: Annotated[
+        Path,
+        typer.Argument(
+            metavar="STROKES",
+            help="The light: an RGBA PNG, an RGB picture, a float EXR or NPY map, or a JSON list of strokes.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="OUT", help="PNG, JPEG, TIFF or WebP [default: PHOTO-relit.png]."
+        ),
+    ] = None,
+    bundle: options.Bundle = None,
+    device: options.Device = "auto",
+    ops: options.Ops = "auto",
+    steps: options.Steps = None,
+    guidance: options.Guidance = None,
+    seed: options.Seed = 0,
+    intensity: options.Intensity = 1.0,
+    key: Annotated[
+        Literal["black"] | None, typer.Option(help="Read what is exactly black in STROKES as unspecified.")
+    ] = None,
+    as_json: options.Json = False,
+    debug: options.Debug = False,
+) -> None:
+    """Relight PHOTO by the light drawn in STROKES.
+
+    STROKES says how bright, and in which colour, white paper on the surface would be there: white is the
+    brightest that the photo can show, black is no light. What it leaves open the model completes.
+
+    \b
+    An RGBA picture of the photo's shape: paint on a transparent layer.
+      dior-rt relight photo.jpg strokes.png
+    One warm stroke, three times as strong, into a TIFF:
+      echo '[{"points": [[80, 120], [240, 300]], "width": 40, "color": "#ffb060"}]' > warm.json
+      dior-rt relight photo.jpg warm.json --intensity 3 -o warm.tif
+    A picture whose black means "not drawn":
+      dior-rt relight photo.jpg light.jpg --key black
+    """
+    watch = Watch()
+    import numpy as np
+
+    from dior_rt.pictures import check_output, read_photo, write_photo
+    from dior_rt.strokes import read_strokes
+
+    out = out or photo.with_name(f"{photo.stem}-relit.png")
+    _refuse_same(out, photo, strokes)
+    picture = read_photo(photo)
+    check_output(out, picture)
+    drawing = read_strokes(strokes, picture.size, key)
+    watch.lap("read")
+    relighter = _load(bundle, device, ops)
+    watch.lap("load")
+    with _progress("Relighting") as advance:
+        relit = relighter.relight(
+            picture.pixels,
+            drawing,
+            steps=steps,
+            guidance=guidance,
+            seed=seed,
+            intensity=intensity,
+            progress=watch.first_step(advance),
+        )
+    watch.lap("relight")
+    settings = _settings(relighter) | {
+        "steps": relit.steps,
+        "guidance": relit.guidance,
+        "seed": relit.seed,
+        "intensity": relit.intensity,
+    }
+    write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
+    watch.lap("write")
+    notices = [*picture.notices, *([relit.notice] if relit.notice else [])]
+    _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, notices, as_json)
+
+
+def estimate(
+    photo: options.Photo,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="LUMI", help="EXR, NPY or a picture [default: PHOTO-lumi.exr]."),
+    ] = None,
+    bundle: options.Bundle = None,
+    device: options.Device = "auto",
+    ops: options.Ops = "auto",
+    steps: options.Steps = None,
+    seed: options.Seed = 0,
+    as_json: options.Json = False,
+    debug: options.Debug = False,
+) -> None:
+    """Estimate the light that lies on PHOTO: its Lumi map.
+
+    A Lumi map holds the light that would leave each surface if all were white and matte. EXR and NPY keep it
+    linear and in full; a PNG shows it, clipped to display white. It has the size of the model's light grid.
+
+    \b
+      dior-rt estimate photo.jpg
+      dior-rt estimate photo.jpg -o lumi.png
+    """
+    watch = Watch()
+    from dior_rt.pictures import read_photo
+    from dior_rt.strokes import check_lumi_output, write_lumi
+
+    out = out or photo.with_name(f"{photo.stem}-lumi.exr")
+    _refuse_same(out, photo)
+    picture = read_photo(photo)
+    check_lumi_output(out)
+    watch.lap("read")
+    relighter = _load(bundle, device, ops)
+    watch.lap("load")
+    with _progress("Estimating") as advance:
+        lumi = relighter.estimate(picture.pixels, steps=steps, seed=seed, progress=watch.first_step(advance))
+    watch.lap("estimate")
+    settings = _settings(relighter) | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
+    write_lumi(out, lumi, settings)
+    watch.lap("write")
+    _report(out, lumi.shape[:2], settings, watch.seconds, relighter, picture.notices, as_json)
+
+
+def sparsify(
+    lumi: Annotated[
+        Path, typer.Argument(metavar="LUMI", help="A dense Lumi map: EXR or NPY, or a picture of one.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="STROKES", help="RGBA PNG, or NPY to keep all.")
+    ],
+    mode: Annotated[
+        Literal["strokes", "coarse", "dense"], typer.Option(help="How much of the map is kept, and how.")
+    ] = "strokes",
+    seed: options.Seed = 0,
+    debug: options.Debug = False,
+) -> None:
+    """Make of a dense Lumi map what a person might have drawn.
+
+    \b
+      dior-rt estimate photo.jpg -o lumi.exr
+      dior-rt sparsify lumi.exr -o strokes.png --seed 7
+      dior-rt relight photo.jpg strokes.png --intensity 2
+    """
+    from dior_rt.kernels import NumpyOps
+    from dior_rt.strokes import check_strokes_output, read_lumi, write_strokes
+
+    _refuse_same(out, lumi)
+    check_strokes_output(out)
+    strokes = NumpyOps().sparsify(read_lumi(lumi), mode, seed)
+    write_strokes(out, strokes, {"version": __version__, "mode": mode, "seed": seed})
+    if out.suffix.lower() == ".png" and (strokes.light[strokes.mask > 0] > 1).any():
+        _say("Light above display white was clipped; a .npy file keeps it.")
+
+
+class Watch:
+    """Seconds by stage, and until the first step of the sampler."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._start = self._last = perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Book the time since the last lap on `stage`."""
+        now = perf_counter()
+        self.seconds[stage], self._last = now - self._last, now
+
+    def first_step(self, advance: Callable[[int, int], None]) -> Callable[[int, int], None]:
+        """`advance`, which also notes when it is called first."""
+
+        def noted(step: int, steps: int) -> None:
+            self.seconds.setdefault("first_step", perf_counter() - self._start)
+            advance(step, steps)
+
+        return noted
+
+
+def _load(bundle: Path | None, device: str, ops: str) -> Relighter:
+    from dior_rt.relight import Relighter
+
+    return Relighter(bundle, device, ops)
+
+
+def _settings(relighter: Relighter) -> dict[str, Any]:
+    """What made the result, for its metadata. The manifest's hash covers those of all files."""
+    from dior_rt.bundle import MANIFEST
+
+    manifest = (relighter.bundle.folder / MANIFEST).read_bytes()
+    return {
+        "version": __version__,
+        "bundle": relighter.bundle.manifest.name,
+        "bundle_sha256": hashlib.sha256(manifest).hexdigest(),
+        "device": relighter.device,
+        "ops": relighter.ops,
+    }
+
+
+def _report(
+    out: Path,
+    size: tuple[int, ...],
+    settings: dict[str, Any],
+    seconds: dict[str, float],
+    relighter: Relighter,
+    notices: list[str] | tuple[str, ...],
+    as_json: bool,
+) -> None:
+    if not as_json:
+        for notice in notices:
+            _say(notice)
+        return
+    report = {
+        "result": str(out),
+        "size": [size[1], size[0]],
+        "settings": settings,
+        "seconds": {stage: round(value, 4) for stage, value in seconds.items()},
+        "device": {"name": relighter.device, "reason": relighter.device_reason},
+        "ops": {"name": relighter.ops, "reason": relighter.ops_reason},
+        "notices": list(notices),
+    }
+    typer.echo(json.dumps(report, indent=2))
+
+
+def _say(notice: str) -> None:
+    typer.echo(f"dior-rt: {notice}", err=True)
+
+
+def _refuse_same(out: Path, *inputs: Path) -> None:
+    """Raise InputError where the result would replace one of the files it is made from."""
+    for path in inputs:
+        if out.exists() and path.exists() and out.samefile(path):
+            raise InputError(f"{out} is read from; name another file for the result.")
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
+    """A callback that moves a bar on a terminal, and does nothing elsewhere."""
+    if not sys.stderr.isatty():
+        yield lambda step, steps: None
+        return
+    with typer.progressbar(length=1000, label=label, file=sys.stderr) as bar:
+
+        def advance(step: int, steps: int) -> None:
+            bar.update(1000 * step // steps - bar.pos)
+
+        yield advance
