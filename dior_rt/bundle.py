@@ -109,6 +109,11 @@ class Bundle:
     folder: Path
     manifest: Manifest
 
+    @property
+    def sha256(self) -> str:
+        """The bundle's identity: the hash of its manifest, which holds the hashes of its files."""
+        return _sha256(self.folder / MANIFEST)
+
     def path(self, graph: str) -> Path:
         """The ONNX file of the graph of that name; BundleError where there is none."""
         if graph not in self.manifest.graphs:

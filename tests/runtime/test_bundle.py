@@ -165,6 +165,13 @@ def test_symbolic_links_out_of_the_folder_are_refused(folder, tmp_path, what):
         read_bundle(folder)
 
 
+def test_a_bundle_is_known_by_its_content(tmp_path, files):
+    same = [write_bundle(tmp_path / name, MANIFEST, files).sha256 for name in "ab"]
+    files["probe.npz"].write_bytes(b"other")
+    other = write_bundle(tmp_path / "c", MANIFEST, files).sha256
+    assert same[0] == same[1] != other
+
+
 @pytest.mark.parametrize("damage", ["cut", "flip", "remove"])
 def test_damaged_files_are_refused(folder, damage):
     path = folder / "nets" / "model.onnx"
