@@ -2,6 +2,7 @@
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -51,7 +52,7 @@ def test_the_result_is_what_torch_and_a_plain_loop_give(relighter, network, reci
     u = torch.linspace(1, 0, 5)
     sigmas = 8 * u / (1 + 7 * u)
     with torch.inference_mode():
-        for now, then in zip(sigmas, sigmas[1:], strict=False):
+        for now, then in pairwise(sigmas):
             null = network(x, now[None], seen, 0 * light, 0 * mask, mode)
             cond = network(x, now[None], seen, light, mask, mode)
             x = x + (then - now) * (null + 2 * (cond - null))
