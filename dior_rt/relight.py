@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dior_rt.bundle import MOST_STEPS, Bundle, default_bundle, read_bundle
-from dior_rt.errors import BundleError, Cancelled, DeviceError, InputError
+from dior_rt.errors import Cancelled, DeviceError, InputError
 from dior_rt.family import Family
 from dior_rt.family.mini import Mini
+from dior_rt.family.qwen import Qwen
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.sampler import Array, draw_noise, sample
@@ -202,7 +203,7 @@ def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]
     """Load a bundle's networks; raises what its family raises."""
     if bundle.manifest.family == "mini":
         return Mini(bundle, device, threads)
-    raise BundleError(f"This dior-rt cannot run the family {bundle.manifest.family}.")
+    return Qwen(bundle, device, threads)
 
 
 def _check_settings(steps: int, guidance: float, seed: int, intensity: float) -> None:

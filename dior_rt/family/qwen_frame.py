@@ -1,8 +1,9 @@
 """How a photo lies in the picture that the model sees, so that the result comes back aligned to the pixel.
 
-The model wants sides that are multiples of 32 and some 1024^2 pixels. Stretching the photo to such a size and the result
-back would do, if this family of models did not answer a stretched picture with one that is shifted and zoomed. So the
-photo keeps its shape and is padded by its mirror image; the result is cut out of the same place.
+The model wants sides that are multiples of 32 and some 1024 x 1024 pixels. Stretching the photo to such a
+size and the result back would do, if models of this family did not answer a stretched picture with one that
+is shifted and zoomed. So the photo keeps its shape, as the content of a canvas that is filled up with the
+content's mirror image; the result is cut out of the same place.
 """
 
 from __future__ import annotations
@@ -22,21 +23,26 @@ def fit_area(area: int, height: int, width: int, multiple: int) -> tuple[int, in
     return max(1, round(rows / multiple)) * multiple, max(1, round(columns / multiple)) * multiple
 
 
+def fit_content(area: int, height: int, width: int, multiple: int) -> tuple[int, int]:
+    """(rows, columns) of a photo's content: of its shape, as large as the size of `fit_area` allows."""
+    rows, columns = fit_area(area, height, width, multiple)
+    scale = min(rows / height, columns / width)
+    return max(1, round(height * scale)), max(1, round(width * scale))
+
+
 @dataclass(frozen=True)
 class Frame:
-    """A canvas, and the content in it that the photo becomes: (rows, columns) each, and the content's corner."""
+    """A canvas, and the content in the middle of it: (rows, columns) each, and the content's corner."""
 
     canvas: tuple[int, int]
     content: tuple[int, int]
     corner: tuple[int, int]
 
     @classmethod
-    def around(cls, height: int, width: int, area: int, multiple: int) -> Frame:
-        """The frame for a photo of height x width: the largest content of its shape, in the middle."""
-        canvas = fit_area(area, height, width, multiple)
-        scale = min(canvas[0] / height, canvas[1] / width)
-        rows, columns = (max(1, round(side * scale)) for side in (height, width))
-        return cls(canvas, (rows, columns), ((canvas[0] - rows) // 2, (canvas[1] - columns) // 2))
+    def around(cls, content: tuple[int, int], multiple: int) -> Frame:
+        """The smallest canvas whose sides are multiples of `multiple`."""
+        rows, columns = (-(-side // multiple) * multiple for side in content)
+        return cls((rows, columns), content, ((rows - content[0]) // 2, (columns - content[1]) // 2))
 
     def pad(self, content: NDArray[np.uint8], mirror: bool) -> NDArray[np.uint8]:
         """Lay content (h, w, 3) on the canvas, surrounded by its mirror image or by black."""
@@ -50,8 +56,11 @@ class Frame:
         return canvas[top : top + rows, left : left + columns]
 
 
-def resize(pixels: NDArray[np.uint8], size: tuple[int, int], filter: Image.Resampling) -> NDArray[np.uint8]:
-    """Resize (h, w, 3) to (rows, columns) as Pillow does; unchanged where it has that size."""
+def resize(pixels: NDArray, size: tuple[int, int], method: Image.Resampling) -> NDArray:
+    """Resize (h, w, 3), uint8 or float32, to (rows, columns) as Pillow does; its own size leaves it as it is."""
     if pixels.shape[:2] == size:
         return pixels
-    return np.asarray(Image.fromarray(pixels).resize(size[::-1], filter))
+    if pixels.dtype == np.uint8:
+        return np.asarray(Image.fromarray(pixels).resize(size[::-1], method))
+    planes = [Image.fromarray(plane).resize(size[::-1], method) for plane in np.moveaxis(pixels, -1, 0)]
+    return np.stack([np.asarray(plane) for plane in planes], axis=-1)

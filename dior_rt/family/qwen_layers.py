@@ -23,9 +23,15 @@ class Layers:
     """
 
     def __init__(
-        self, bundle: Bundle, first: str, device: str = "auto", threads: int | None = None, memory: int | None = None
+        self,
+        bundle: Bundle,
+        first: str,
+        device: str = "auto",
+        threads: int | None = None,
+        memory: int | None = None,
     ) -> None:
-        """Open the graph `first` on the device, which is chosen by it. memory: None takes a share of what is free.
+        """Open the graph `first` on the device, which is chosen by it. memory: None takes a share of what is
+        free.
 
         Raises what `open_engine` raises.
         """
@@ -42,7 +48,7 @@ class Layers:
         return self.engine(name).run(feeds)
 
     def engine(self, name: str) -> Engine:
-        """The graph's engine. Keep it no longer than needed: it may be all that keeps its weights in memory."""
+        """The graph's engine. Hold it no longer than needed: it may be all that keeps its weights."""
         with self._lock:
             if name in self._kept:
                 return self._kept[name]

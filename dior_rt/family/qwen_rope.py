@@ -18,7 +18,9 @@ def rates(width: int, theta: float) -> Array:
 
 def turns(places: NDArray[np.int64], widths: Sequence[int], theta: float) -> tuple[Array, Array]:
     """cos and sin for tokens at `places` (tokens, axes); axis k turns widths[k] of a head's numbers."""
-    angles = [np.outer(places[:, k].astype(np.float32), rates(width, theta)) for k, width in enumerate(widths)]
+    angles = [
+        np.outer(places[:, k].astype(np.float32), rates(width, theta)) for k, width in enumerate(widths)
+    ]
     joined = np.concatenate(angles, axis=1)
     return np.cos(joined), np.sin(joined)
 
@@ -26,8 +28,8 @@ def turns(places: NDArray[np.int64], widths: Sequence[int], theta: float) -> tup
 def joint_places(text: int, pictures: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
     """Places (frame, row, column) of `text` words, then of the pictures' tokens, given as (rows, columns).
 
-    Picture k is frame k, its rows and columns are counted from its middle; words follow on the diagonal, beyond the
-    edge of the largest picture.
+    Picture k is frame k, its rows and columns are counted from its middle; words follow on the diagonal,
+    beyond the edge of the largest picture.
     """
     first = max(max(rows // 2, columns // 2) for rows, columns in pictures)
     words = np.repeat(np.arange(first, first + text)[:, None], 3, axis=1)

@@ -1,16 +1,17 @@
 """Writes one ONNX graph, operation by operation, streaming its weights to a file beside it.
 
-A graph is built by hand rather than traced so that no weight has to exist while its graph is made, and so that the
-fused operations of ONNX Runtime (attention that never holds the whole matrix of scores, rotary embedding, block-wise
-int4) and the casts of mixed precision stand where they are meant to.
+A graph is built by hand rather than traced so that no weight has to exist while its graph is made, and so
+that the fused operations of ONNX Runtime (attention that never holds the whole matrix of scores, rotary
+embedding, block-wise int4) and the casts of mixed precision stand where they are meant to.
 
-Activations are float32 (tokens, width) between operations, in every precision. Only `linear` and `attention` compute
-in less, and each first divides what it rounds by its largest value, so that nothing can overflow:
+Activations are float32 (tokens, width) between operations, in every precision. Only `linear` and `attention`
+compute in less, and each first divides what it rounds by its largest value, so that nothing can overflow:
 
     fp32   y = x W + b
     fp16   y = s (fp16(x / s) fp16(W)) + b                  s = the row's largest |x|
-    int8   y = s t (int8(127 x / s) int8(W / t)) + b        t = the column's largest |W| / 127 (weights per channel)
-    int4   y = x Q + b                                      Q = int4 by blocks of 32 along the input (MatMulNBits)
+    int8   y = s t (int8(127 x / s) int8(W / t)) + b        t = the column's largest |W| / 127 (weights per
+    channel) int4   y = x Q + b                                      Q = int4 by blocks of 32 along the input
+    (MatMulNBits)
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class GraphWriter:
         self._outputs.append(Tensor(name, "float32", shape))
 
     def op(self, kind: str, *inputs: str, domain: str = "", **attributes: Any) -> str:
-        """Append an operation of one output. A trailing optional input that is left out is "" (as in ONNX)."""
+        """Append an operation of one output. "" leaves an optional input out, as in ONNX."""
         return self.ops(kind, 1, *inputs, domain=domain, **attributes)[0]
 
     def ops(self, kind: str, outputs: int, *inputs: str, domain: str = "", **attributes: Any) -> list[str]:
@@ -84,7 +85,7 @@ class GraphWriter:
         self._nodes.append(helper.make_node(kind, list(inputs), names, domain=domain, **attributes))
         return names
 
-    def constant(self, value: Array) -> str:
+    def constant(self, value: Array | np.generic) -> str:
         """A tensor of the graph; large ones go to the file of weights."""
         value = np.ascontiguousarray(value)
         proto = TensorProto(
@@ -122,12 +123,14 @@ class GraphWriter:
         return Graph(self.path.name, tuple(self._inputs), tuple(self._outputs))
 
     def linear(self, x: str, weight: Array, bias: Array | None, precision: Precision | None = None) -> str:
-        """y = x W^T + b for x (rows, in) and a float32 weight (out, in), in this graph's precision or the one given."""
+        """y = x W^T + b for x (rows, in) and a float32 weight (out, in); precision None is the graph's."""
         precision = precision or self.precision
         if precision == "fp32":
             inputs = [x, self.constant(weight), *([] if bias is None else [self.constant(bias)])]
             return self.op("Gemm", *inputs, transB=1)
-        y = {"fp16": self._linear_fp16, "int8": self._linear_int8, "int4": self._linear_int4}[precision](x, weight)
+        y = {"fp16": self._linear_fp16, "int8": self._linear_int8, "int4": self._linear_int4}[precision](
+            x, weight
+        )
         return y if bias is None else self.op("Add", y, self.constant(bias))
 
     def layer_norm(self, x: str, width: int, eps: float) -> str:
@@ -148,7 +151,8 @@ class GraphWriter:
     def rotate(self, x: str, cos: str, sin: str, *, interleaved: bool) -> str:
         """Rotary embedding of every head of x (tokens, width) by the angles of (tokens, head width / 2).
 
-        interleaved: the pairs that turn are neighbours (0, 1), (2, 3) ..., else the halves (0, d/2), (1, d/2 + 1) ...
+        interleaved: the pairs that turn are neighbours (0, 1), (2, 3) ..., else the halves (0, d/2), (1, d/2
+        + 1) ...
         """
         rows = self.op("Unsqueeze", x, self.ints(0))
         turned = self.op(
@@ -156,9 +160,7 @@ class GraphWriter:
         )
         return self.op("Squeeze", turned, self.ints(0))
 
-    def attention(
-        self, q: str, k: str, v: str, heads: int, *, bias: str = "", causal: bool = False
-    ) -> str:
+    def attention(self, q: str, k: str, v: str, heads: int, *, bias: str = "", causal: bool = False) -> str:
         """softmax(q k^T / sqrt(head width) + bias) v, head by head, for (tokens, heads * head width) each.
 
         bias: (1, 1, tokens, tokens), or "" for none.
@@ -173,7 +175,12 @@ class GraphWriter:
         rows = [self.op("Unsqueeze", value, self.ints(0)) for value in (q, k, v)]
         optional = ["", "", bias] if bias else []
         mixed = self.op(
-            "MultiHeadAttention", *rows, *optional, domain=CONTRIB, num_heads=heads, unidirectional=int(causal)
+            "MultiHeadAttention",
+            *rows,
+            *optional,
+            domain=CONTRIB,
+            num_heads=heads,
+            unidirectional=int(causal),
         )
         mixed = self.op("Squeeze", mixed, self.ints(0))
         if not scale:
@@ -192,7 +199,11 @@ class GraphWriter:
         step = np.maximum(np.abs(weight).max(1, keepdims=True), TINY) / 127
         quantized = self.constant(np.rint(weight / step).astype(np.int8).T)
         y = self.op("MatMulInteger", self.op("Cast", rounded, to=TensorProto.INT8), quantized)
-        y = self.op("Mul", self.op("Cast", y, to=TensorProto.FLOAT), self.constant((step[:, 0] / 127).astype(np.float32)))
+        y = self.op(
+            "Mul",
+            self.op("Cast", y, to=TensorProto.FLOAT),
+            self.constant((step[:, 0] / 127).astype(np.float32)),
+        )
         return self.op("Mul", y, scale)
 
     def _linear_int4(self, x: str, weight: Array) -> str:
@@ -221,7 +232,7 @@ class GraphWriter:
             self._data = self.data_path.open("wb")
         offset = -(-self._data.tell() // ALIGNMENT) * ALIGNMENT
         self._data.seek(offset)
-        self._data.write(value)
+        value.tofile(self._data)
         proto.data_location = TensorProto.EXTERNAL
         for key, item in (("location", self.data_path.name), ("offset", offset), ("length", value.nbytes)):
             proto.external_data.add(key=key, value=str(item))
@@ -234,8 +245,9 @@ class GraphWriter:
 def quantize_int4(weight: Array) -> tuple[Array, Array]:
     """Symmetric int4 by blocks of 32 inputs, as MatMulNBits stores it.
 
-    weight: float32 (out, in). Returns uint8 (out, blocks, 16) of two values a byte, the lower half first, each 8 above
-    what it stands for, and float32 scales (out * blocks,). The value of largest magnitude in a block is exact.
+    weight: float32 (out, in). Returns uint8 (out, blocks, 16) of two values a byte, the lower half first,
+    each 8 above what it stands for, and float32 scales (out * blocks,). The value of largest magnitude in a
+    block is exact.
     """
     rows, columns = weight.shape
     blocks = -(-columns // BLOCK)

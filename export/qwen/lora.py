@@ -1,10 +1,10 @@
 """LoRA files: which layers they change, and by how much.
 
 One file may name a layer in diffusers' way (transformer.<layer>.lora_A.weight), peft's
-(base_model.model.<layer>.lora_A.default.weight), ComfyUI's (diffusion_model.<layer>.lora_down.weight) or Kohya's
-(lora_unet_<layer with _ for .>.lora_down.weight). The change is strength * alpha / rank * B A: the rank is read from
-the matrices, alpha from the file's own tensors, its metadata, or peft's adapter_config.json beside it; without any,
-alpha is the rank.
+(base_model.model.<layer>.lora_A.default.weight), ComfyUI's (diffusion_model.<layer>.lora_down.weight) or
+Kohya's (lora_unet_<layer with _ for .>.lora_down.weight). The change is strength * alpha / rank * B A: the
+rank is read from the matrices, alpha from the file's own tensors, its metadata, or peft's adapter_config.json
+beside it; without any, alpha is the rank.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from dior_rt.errors import InputError
 
 PREFIXES = ("base_model.model.", "model.diffusion_model.", "diffusion_model.", "transformer.")
 KOHYA = "lora_unet_"
-PART = re.compile(r"\.(?:(lora_A|lora_down|lora\.down)|(lora_B|lora_up|lora\.up))(?:\.\w+)?\.weight$|\.(alpha)$")
+PART = re.compile(
+    r"\.(?:(lora_A|lora_down|lora\.down)|(lora_B|lora_up|lora\.up))(?:\.\w+)?\.weight$|\.(alpha)$"
+)
 
 
 @dataclass
@@ -71,8 +73,8 @@ class Lora:
         strange = [layer for layer in self._changes if layer not in layers]
         if strange:
             raise InputError(
-                f"The LoRA {self.path} is for another model: {len(strange)} of its {len(self._changes)} layers, "
-                f"such as {strange[0]!r}, are not in this one."
+                f"The LoRA {self.path} is for another model: {len(strange)} of its {len(self._changes)} "
+                f"layers, such as {strange[0]!r}, are not in this one."
             )
         return [layers[layer] for layer in self._changes]
 
@@ -83,8 +85,8 @@ class Lora:
                 down, up = (tuple(file.get_slice(key).get_shape()) for key in (change.down, change.up))
                 if len(down) != 2 or len(up) != 2 or up[1] != down[0] or (up[0], down[1]) != shapes[layer]:
                     raise InputError(
-                        f"The LoRA {self.path} does not fit this model: its change to {layer!r} is {up} x {down}, "
-                        f"the layer {shapes[layer]}."
+                        f"The LoRA {self.path} does not fit this model: its change to {layer!r} is "
+                        f"{up} x {down}, the layer {shapes[layer]}."
                     )
 
     def delta(self, layer: str) -> NDArray[np.float32] | None:
@@ -145,4 +147,6 @@ def _adapter(path: Path, metadata: Mapping[str, str]) -> _Adapter:
     settings = {key.removeprefix("transformer."): value for key, value in found.items()}
     if settings.get("use_dora") or settings.get("lora_bias"):
         raise InputError(f"{path} is no plain LoRA (it uses DoRA or biases), and cannot be merged.")
-    return _Adapter(settings.get("lora_alpha"), settings.get("alpha_pattern"), bool(settings.get("use_rslora")))
+    return _Adapter(
+        settings.get("lora_alpha"), settings.get("alpha_pattern"), bool(settings.get("use_rslora"))
+    )

@@ -4,11 +4,12 @@
     block.NN    image, text, cos, sin (T + I, d/2), modulation         -> image, text
     head        image, modulation (2, D)                              -> velocity (I, C')
 
-D = heads * d. What the blocks are told of sigma, 12 vectors each (shift, scale and gate, twice, of the image and of the
-text), is their modulation. It depends on nothing else, so it is no part of these graphs: see modulation.py.
+D = heads * d. What the blocks are told of sigma, 12 vectors each (shift, scale and gate, twice, of the image
+and of the text), is their modulation. It depends on nothing else, so it is no part of these graphs: see
+modulation.py.
 
-With zero_cond_t (the 2511 model) the tokens of the reference pictures take the modulation of sigma = 0; `lengths` holds
-how many tokens are being denoised, and how many follow them as references.
+With zero_cond_t (the 2511 model) the tokens of the reference pictures take the modulation of sigma = 0;
+`lengths` holds how many tokens are being denoised, and how many follow them as references.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dior_rt.bundle import Graph
-from dior_rt.errors import InputError
 from dior_rt.export.qwen.graph import GraphWriter, Precision
 from dior_rt.export.qwen.weights import Weights, read_config
 
+from dior_rt.bundle import Graph
+from dior_rt.errors import InputError
+
 EPS = 1e-6
+THETA = 10000.0  # of the rotary positions; its config has none
 
 
 @dataclass(frozen=True)
@@ -51,17 +54,23 @@ class TransformerConfig:
             if found.get(name):
                 raise InputError(f"{path} asks for {name}, which is another model than Qwen-Image-Edit.")
         try:
-            known = {name: found[name] for name in cls.__dataclass_fields__ if name not in ("zero_cond_t", "patch_size")}
+            known = {
+                name: found[name]
+                for name in cls.__dataclass_fields__
+                if name not in ("zero_cond_t", "patch_size")
+            }
             known["axes_dims_rope"] = tuple(known["axes_dims_rope"])
             return cls(zero_cond_t=bool(found.get("zero_cond_t", False)), **known)
         except (KeyError, TypeError) as error:
-            raise InputError(f"{path} describes no QwenImageTransformer2DModel: {error} is missing.") from error
+            raise InputError(
+                f"{path} describes no QwenImageTransformer2DModel: {error} is missing."
+            ) from error
 
 
 def write_transformer(
     folder: Path, config: TransformerConfig, weights: Weights, precision: Precision
 ) -> Iterator[tuple[str, Graph]]:
-    """Write embed, every block and head into `folder`, yielding each as it is done. Embed and head stay fp32."""
+    """Write embed, blocks and head into `folder`, yielding each as it is done. Embed and head stay fp32."""
     yield "embed", write_embed(folder / "embed.onnx", config, weights)
     for index in range(config.num_layers):
         name = f"block.{index:02}"
@@ -89,15 +98,20 @@ def write_head(path: Path, config: TransformerConfig, weights: Weights) -> Graph
         return g.finish("head")
 
 
-def write_block(path: Path, config: TransformerConfig, weights: Weights, index: int, precision: Precision) -> Graph:
-    """One QwenImageTransformerBlock with its QwenDoubleStreamAttnProcessor2_0, as numbers without complex parts."""
-    width, heads, at = config.width, config.num_attention_heads, f"transformer_blocks.{index}."
+def write_block(
+    path: Path, config: TransformerConfig, weights: Weights, index: int, precision: Precision
+) -> Graph:
+    """One QwenImageTransformerBlock with its QwenDoubleStreamAttnProcessor2_0, in real numbers."""
+    width, at = config.width, f"transformer_blocks.{index}."
     with GraphWriter(path, precision) as g:
         image = g.input("image", "image_tokens", width)
         text = g.input("text", "text_tokens", width)
         cos = g.input("cos", "tokens", config.attention_head_dim // 2)
         sin = g.input("sin", "tokens", config.attention_head_dim // 2)
-        mods = {"img": _image_modulation(g, config), "txt": Modulation(g, [g.input("text_modulation", 6, width)])}
+        mods = {
+            "img": _image_modulation(g, config),
+            "txt": Modulation(g, [g.input("text_modulation", 6, width)]),
+        }
 
         streams = {"txt": text, "img": image}
         normed = {name: mods[name].norm(x, 0, width) for name, x in streams.items()}
@@ -145,7 +159,7 @@ def _attend(
 
 
 class Modulation:
-    """Shift, scale and gate for each of a block's two halves, from tables (6, D): one, or one for each part of x."""
+    """Shift, scale and gate for a block's two halves, from tables (6, D): one, or one for each part of x."""
 
     def __init__(self, g: GraphWriter, tables: list[str], lengths: str = "") -> None:
         self._g, self._lengths = g, lengths
@@ -153,7 +167,9 @@ class Modulation:
 
     def norm(self, x: str, half: int, width: int) -> str:
         """LayerNorm(x) (1 + scale) + shift."""
-        return self._each(x, lambda part, rows: modulated(self._g, part, rows[3 * half + 1], rows[3 * half], width))
+        return self._each(
+            x, lambda part, rows: modulated(self._g, part, rows[3 * half + 1], rows[3 * half], width)
+        )
 
     def gate(self, x: str, half: int) -> str:
         return self._each(x, lambda part, rows: self._g.op("Mul", part, rows[3 * half + 2]))

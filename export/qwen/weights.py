@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
+from dior_rt.export.qwen.lora import Lora
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from dior_rt.errors import InputError
-from dior_rt.export.qwen.lora import Lora
 
 Array = NDArray[np.float32]
 
@@ -54,21 +54,34 @@ class Checkpoint:
             return tuple(tensors.get_slice(key).get_shape())
 
     def __getitem__(self, name: str) -> Array:
+        return self._read(name, lambda tensors, key: tensors.get_tensor(key))
+
+    def rows(self, name: str, indices: Sequence[int]) -> Array:
+        """These rows of a tensor, read without the others."""
+        return self._read(
+            name, lambda tensors, key: torch.stack([tensors.get_slice(key)[i] for i in indices])
+        )
+
+    def _read(self, name: str, read: Callable[[Any, str], torch.Tensor]) -> Array:
         file, key = self._place(name)
         try:
             with safe_open(file, framework="pt") as tensors:
-                tensor = tensors.get_tensor(key)
+                tensor = read(tensors, key)
         except (OSError, SafetensorError) as error:
             raise InputError(f"Cannot read {key!r} from {file}: {error}.") from error
         if tensor.dtype not in READABLE:
-            raise InputError(f"{file} stores {key!r} as {tensor.dtype}; export needs float32, float16 or bfloat16.")
+            raise InputError(
+                f"{file} stores {key!r} as {tensor.dtype}; export needs float32, float16 or bfloat16."
+            )
         if not torch.isfinite(tensor).all():
             raise InputError(f"{file} is damaged: {key!r} holds values that are not finite.")
         return tensor.float().numpy()
 
     def _place(self, name: str) -> tuple[Path, str]:
         if name not in self._places:
-            raise InputError(f"{self.path} has no tensor {name!r}; is it the model that its config describes?")
+            raise InputError(
+                f"{self.path} has no tensor {name!r}; is it the model that its config describes?"
+            )
         return self._places[name]
 
 
@@ -119,7 +132,9 @@ def _shards(path: Path) -> list[Path]:
         return [path / name for name in names]
     files = sorted(path.glob("*.safetensors"))
     if len(files) != 1:
-        raise InputError(f"{path} should hold one safetensors file or an index of several; it holds {len(files)}.")
+        raise InputError(
+            f"{path} should hold one safetensors file or an index of several; it holds {len(files)}."
+        )
     return files
 
 

@@ -15,7 +15,12 @@ from diffusers import (
 )
 from PIL import Image
 from tokenizers.pre_tokenizers import ByteLevel
-from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration, Qwen2Tokenizer, Qwen2VLProcessor
+from transformers import (
+    Qwen2_5_VLConfig,
+    Qwen2_5_VLForConditionalGeneration,
+    Qwen2Tokenizer,
+    Qwen2VLProcessor,
+)
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 SPECIAL_TOKENS = (
@@ -132,7 +137,9 @@ def vae(seed: int = 3) -> AutoencoderKLQwenImage:
     return model
 
 
-def pipeline(*, zero_cond_t: bool = True, scheduler: dict[str, object] | None = None) -> QwenImageEditPlusPipeline:
+def pipeline(
+    *, zero_cond_t: bool = True, scheduler: dict[str, object] | None = None
+) -> QwenImageEditPlusPipeline:
     words = tokenizer()
     pipe = QwenImageEditPlusPipeline(
         scheduler=FlowMatchEulerDiscreteScheduler(**(scheduler or SCHEDULER)),

@@ -1,0 +1,164 @@
+"""A diffusers folder of Qwen-Image-Edit: which files hold what, read as far as the export needs it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from dior_rt.export.qwen.lora import Lora
+from dior_rt.export.qwen.text import TextConfig
+from dior_rt.export.qwen.transformer import TransformerConfig
+from dior_rt.export.qwen.vae import VaeConfig
+from dior_rt.export.qwen.weights import Checkpoint, Merged, read_config
+from transformers import Qwen2Tokenizer
+
+from dior_rt.errors import InputError
+from dior_rt.family.qwen_config import TextSettings, VisionSettings
+from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
+
+VISION_AREA: Final = 384**2
+MULTIPLE: Final = 32
+
+# The words around every prompt that the model was trained with; the embeddings of the first 64 are dropped.
+TEMPLATE: Final = (
+    "<|im_start|>system\nDescribe the key features of the input image (color, shape, size, texture, objects, "
+    "background), then explain how the user's text instruction should alter or modify the image. Generate a "
+    "new image that meets the user's requirements while maintaining consistency with the original input where "
+    "appropriate."
+    "<|im_end|>\n<|im_start|>user\n{}<|im_end|>\n<|im_start|>assistant\n"
+)
+SKIP: Final = 64
+PICTURE: Final = "Picture {}: <|vision_start|><|image_pad|><|vision_end|>"
+
+
+class Sources:
+    """The parts of a model on disk. Files may also be named one by one, where a part is not in the folder."""
+
+    def __init__(self, folder: Path, loras: Sequence[Lora] = (), transformer: Path | None = None) -> None:
+        """transformer: a safetensors file with the transformer's weights, in place of the folder's.
+
+        Raises InputError for a folder that is no such model, and for LoRAs that do not fit it.
+        """
+        if not folder.is_dir():
+            raise InputError(f"There is no model folder at {folder}.")
+        self.folder = folder
+        self.transformer = TransformerConfig.read(folder / "transformer" / "config.json")
+        self.transformer_base = Checkpoint(transformer or folder / "transformer")
+        self.transformer_weights = Merged(self.transformer_base, loras)
+        self.vae = VaeConfig.read(folder / "vae" / "config.json")
+        self.vae_weights = Checkpoint(folder / "vae")
+
+    @cached_property
+    def text(self) -> TextConfig:
+        return TextConfig.read(self.folder / "text_encoder")
+
+    @cached_property
+    def text_weights(self) -> Checkpoint:
+        return Checkpoint(self.folder / "text_encoder")
+
+    def schedule(self) -> ShiftSchedule | DynamicShiftSchedule:
+        """The scheduler's; InputError where it is none that the runtime has."""
+        path = self.folder / "scheduler" / "scheduler_config.json"
+        found = read_config(path)
+        strange = [f"use_{kind}_sigmas" for kind in ("karras", "exponential", "beta")] + ["invert_sigmas"]
+        if (
+            any(found.get(name) for name in strange)
+            or found.get("time_shift_type", "exponential") != "exponential"
+        ):
+            raise InputError(f"{path} asks for a schedule that this export does not know.")
+        try:
+            return _schedule(found)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path} describes no schedule that this export knows: {error}.") from error
+
+    def text_settings(self, prompts: dict[str, tuple[int, ...]]) -> TextSettings:
+        """What the runtime has to know to run the text encoder on these prompts."""
+        text, vision = self.text.text, self.text.vision
+        seen = read_config(self.folder / "processor" / "preprocessor_config.json")
+        limits: Any = seen.get("size", {})
+        return TextSettings(
+            prompts=prompts,
+            picture_id=self._picture_id(),
+            skip=SKIP,
+            blocks=text.num_hidden_layers,
+            head=text.hidden_size // text.num_attention_heads,
+            theta=float(text.rope_parameters["rope_theta"]),
+            sections=tuple(text.rope_parameters["mrope_section"]),
+            vision=VisionSettings(
+                area=VISION_AREA,
+                multiple=MULTIPLE,
+                least_pixels=int(seen.get("min_pixels") or limits["shortest_edge"]),
+                most_pixels=int(seen.get("max_pixels") or limits["longest_edge"]),
+                mean=tuple(seen["image_mean"]),  # type: ignore[arg-type]
+                std=tuple(seen["image_std"]),  # type: ignore[arg-type]
+                patch=vision.patch_size,
+                frames=vision.temporal_patch_size,
+                merge=vision.spatial_merge_size,
+                window=vision.window_size,
+                whole_blocks=tuple(vision.fullatt_block_indexes),
+                blocks=vision.depth,
+                head=vision.hidden_size // vision.num_heads,
+                theta=float(vision.rope_parameters["rope_theta"]),
+            ),
+        )
+
+    @cached_property
+    def _tokenizer(self) -> Qwen2Tokenizer:
+        try:
+            return Qwen2Tokenizer.from_pretrained(self.folder / "tokenizer", local_files_only=True)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"Cannot read the tokenizer of {self.folder}: {str(error).splitlines()[0]}"
+            ) from error
+
+    def _picture_id(self) -> int:
+        word: Any = self._tokenizer.convert_tokens_to_ids("<|image_pad|>")
+        return int(word)
+
+    def word_ids(self, prompt: str, pictures: int) -> tuple[int, ...]:
+        """A prompt that speaks of so many pictures, in its template, as ids."""
+        said = "".join(PICTURE.format(k + 1) for k in range(pictures)) + prompt
+        ids = tuple(self._tokenizer(TEMPLATE.format(said))["input_ids"])
+        if ids.count(self._picture_id()) != pictures:
+            raise InputError(f"The tokenizer of {self.folder} does not know the word for a picture.")
+        return ids
+
+
+@dataclass(frozen=True)
+class Prompts:
+    """What is said to the model in each mode; relight shows it two pictures, estimate one."""
+
+    relight: str = (
+        "Relight Picture 1 with the light that is drawn in Picture 2. Keep the viewpoint, the shapes, the "
+        "materials and the people. Where Picture 2 is black, the light is free."
+    )
+    estimate: str = "Draw the light that falls on every surface of Picture 1, as if all were white and matte."
+    negative: str = " "
+
+    def each(self) -> dict[str, tuple[str, int]]:
+        """By the name that the runtime uses: the words, and how many pictures come with them."""
+        return {
+            "relight": (self.relight, 2),
+            "relight_negative": (self.negative, 2),
+            "estimate": (self.estimate, 1),
+            "estimate_negative": (self.negative, 1),
+        }
+
+
+def _schedule(found: dict[str, Any]) -> ShiftSchedule | DynamicShiftSchedule:
+    if not found.get("use_dynamic_shifting"):
+        return ShiftSchedule(float(found["shift"]))
+    base, most = float(found["base_shift"]), float(found["max_shift"])
+    if found.get("shift_terminal") is None and base == most:
+        return ShiftSchedule(math.exp(base))
+    return DynamicShiftSchedule(
+        base,
+        most,
+        int(found["base_image_seq_len"]),
+        int(found["max_image_seq_len"]),
+        float(found["shift_terminal"]),
+    )
