@@ -1,26 +1,21 @@
-"""The engine: one ONNX graph on one device, through ONNX Runtime.
-
-A device is named as on the command line: "cpu", "cuda", "cuda:1", "openvino:GPU", or "auto". No graph ever
-moves to another device in silence, and a device that computes wrong results is refused.
-"""
+"""The engine: one ONNX graph on one device, held to the bundle's own answers before it is used."""
 
 from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
-from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
 from dior_rt.bundle import Bundle, Tensor
 from dior_rt.errors import BundleError, DeviceError, InputError
 from dior_rt.files import reason
+from dior_rt.providers import accelerators, open_session, translated
 
 Feeds = Mapping[str, NDArray]
 
@@ -35,36 +30,6 @@ _DTYPES = {
     "tensor(uint8)": "uint8",
     "tensor(int8)": "int8",
     "tensor(bool)": "bool",
-}
-_ORT_ERRORS: tuple[type[Exception], ...] = (
-    RuntimeError,
-    ValueError,
-    *(kind for kind in vars(ort_state).values() if isinstance(kind, type) and issubclass(kind, Exception)),
-)
-
-
-@dataclass(frozen=True)
-class Provider:
-    """An execution provider of ONNX Runtime.
-
-    ort_name: its name there. options: what keeps it in float32. choice: the option that picks one of its
-    devices, if there is one.
-    """
-
-    ort_name: str
-    options: Mapping[str, str] = field(default_factory=dict)
-    choice: str = "device_id"
-
-
-# In the order in which "auto" tries them.
-PROVIDERS = {
-    "cuda": Provider("CUDAExecutionProvider", {"use_tf32": "0"}),
-    "migraphx": Provider("MIGraphXExecutionProvider"),
-    "dml": Provider("DmlExecutionProvider"),
-    "coreml": Provider("CoreMLExecutionProvider", {"ModelFormat": "MLProgram"}, choice="MLComputeUnits"),
-    "webgpu": Provider("WebGpuExecutionProvider"),
-    "openvino": Provider("OpenVINOExecutionProvider", {"precision": "FP32"}, choice="device_type"),
-    "cpu": Provider("CPUExecutionProvider", choice=""),
 }
 
 
@@ -83,7 +48,7 @@ class Engine:
         """
         self.device = device
         self.reason = reason or f"{device} was asked for"
-        self._session = _open_session(model, device, threads)
+        self._session = open_session(model, device, threads)
         self.inputs = tuple(map(_tensor, self._session.get_inputs()))
         self.outputs = tuple(map(_tensor, self._session.get_outputs()))
         # Only the CPU's provider promises to run one session from several threads at once.
@@ -103,9 +68,9 @@ class Binding:
 
     def __init__(self, engine: Engine, constants: Feeds) -> None:
         self._engine = engine
-        self._constants = {name: np.ascontiguousarray(array) for name, array in constants.items()}
+        self._constants = {name: np.asarray(array, order="C") for name, array in constants.items()}
         check_feeds(tuple(tensor for tensor in engine.inputs if tensor.name in constants), constants)
-        with _translated(f"{engine.device} failed"), engine._lock:
+        with translated(engine.device), engine._lock:
             self._binding = engine._session.io_binding()
             self._put(self._constants)
             for output in engine.outputs:
@@ -118,9 +83,9 @@ class Binding:
         and DeviceError where the device fails or computes what is no number.
         """
         engine = self._engine
-        feeds = {name: np.ascontiguousarray(array) for name, array in feeds.items()}
+        feeds = {name: np.asarray(array, order="C") for name, array in feeds.items()}
         check_feeds(engine.inputs, {**self._constants, **feeds})
-        with _translated(f"{engine.device} failed"), engine._lock:
+        with translated(engine.device), engine._lock:
             self._put(feeds)
             engine._session.run_with_iobinding(self._binding)
             arrays = self._binding.copy_outputs_to_cpu()
@@ -142,19 +107,13 @@ def open_engine(bundle: Bundle, graph: str, device: str = "auto", threads: int |
     if device != "auto":
         return _open_tested(bundle, graph, device, threads)
     failures = []
-    for name in available()[:-1]:
+    for name in accelerators():
         try:
             return _open_tested(bundle, graph, name, threads, f"{name} is there and passes its self-test")
         except DeviceError as error:
             failures.append(str(error))
     reason = " ".join(failures) or "ONNX Runtime finds no accelerator here"
     return _open_tested(bundle, graph, "cpu", threads, reason)
-
-
-def available() -> list[str]:
-    """The devices that the installed ONNX Runtime was built for, best first; "cpu" is always the last."""
-    built = ort.get_available_providers()
-    return [name for name, provider in PROVIDERS.items() if provider.ort_name in built]
 
 
 def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
@@ -210,47 +169,6 @@ def _self_test(engine: Engine, probe: Path) -> None:
             raise DeviceError(
                 f"{engine.device} computes wrong results: off by {error_here:.2g} in its self-test."
             )
-
-
-def _open_session(model: Path, device: str, threads: int | None) -> ort.InferenceSession:
-    name, _, choice = device.partition(":")
-    if name not in available() or (choice and not PROVIDERS[name].choice):
-        raise DeviceError(f"There is no device {device!r} here; there is {', '.join(available())}, or auto.")
-    provider = PROVIDERS[name]
-    options = ort.SessionOptions()
-    options.log_severity_level = 3
-    if threads is not None:
-        if threads < 1:
-            raise InputError(f"threads must be at least 1, not {threads}.")
-        options.intra_op_num_threads = threads
-    if name == "dml":  # DirectML's provider demands both
-        options.enable_mem_pattern = False
-        options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
-    providers = [(provider.ort_name, {**provider.options, **({provider.choice: choice} if choice else {})})]
-    if name != "cpu":  # it takes the operations that an accelerator lacks
-        providers.append((PROVIDERS["cpu"].ort_name, {}))
-    try:
-        session = ort.InferenceSession(
-            model,
-            options,
-            providers=providers,
-            enable_fallback=0,
-        )
-    except _ORT_ERRORS as error:
-        # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
-        kind = BundleError if name == "cpu" else DeviceError
-        raise kind(f"{device} cannot load {model}: {reason(error)}.") from error
-    if session.get_providers()[0] != provider.ort_name:
-        raise DeviceError(f"{device} could not be started; ONNX Runtime fell back to the CPU.")
-    return session
-
-
-@contextlib.contextmanager
-def _translated(what: str) -> Iterator[None]:
-    try:
-        yield
-    except _ORT_ERRORS as error:
-        raise DeviceError(f"{what}: {reason(error)}.") from error
 
 
 def _tensor(node: ort.NodeArg) -> Tensor:

@@ -8,10 +8,11 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
-from dior_rt import engine as engines
+from dior_rt import providers
 from dior_rt.bundle import read_bundle, write_bundle
-from dior_rt.engine import Engine, available, open_engine
+from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError, DeviceError, InputError
+from dior_rt.providers import PROVIDERS, available
 
 
 def write_graph(path, nodes, inputs, outputs):
@@ -165,14 +166,12 @@ def test_auto_says_why_it_took_the_cpu(mini_bundle, monkeypatch):
     assert "no accelerator" in engine.reason
 
 
+@pytest.mark.filterwarnings("ignore:Specified provider")
 def test_auto_passes_over_an_accelerator_that_cannot_start(mini_bundle, monkeypatch):
     # This installation has no such provider: ONNX Runtime itself refuses it when the session is made.
-    missing = next(
-        name
-        for name, p in engines.PROVIDERS.items()
-        if p.ort_name not in onnxruntime.get_available_providers()
-    )
-    monkeypatch.setattr(engines, "available", lambda: [missing, "cpu"])
+    built = onnxruntime.get_available_providers()
+    missing = next(name for name, provider in PROVIDERS.items() if provider.ort_name not in built)
+    monkeypatch.setattr(providers, "available", lambda: [missing, "cpu"])
     engine = open_engine(read_bundle(mini_bundle), "velocity")
     assert engine.device == "cpu"
     assert missing in engine.reason
@@ -218,6 +217,12 @@ def test_a_probe_that_cannot_be_read_is_refused(mini_bundle, tmp_path, content):
     )
     with pytest.raises(BundleError, match="self-test"):
         open_engine(bad, "velocity", "cpu")
+
+
+@pytest.mark.parametrize("device", available())
+def test_every_device_here_passes_its_self_test(mini_bundle, device):
+    engine = open_engine(read_bundle(mini_bundle), "velocity", device)
+    assert engine.device == device and engine.reason
 
 
 def test_the_cpu_is_always_there_and_last():

@@ -1,0 +1,121 @@
+"""The devices of ONNX Runtime: their names here, how to open a session on one, and what its errors become.
+
+A device is named as on the command line: "cpu", "cuda", "cuda:1", "openvino:GPU". No graph ever moves to
+another device in silence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import onnxruntime as ort
+from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
+
+from dior_rt.errors import BundleError, DeviceError, InputError
+from dior_rt.files import reason
+
+_ORT_ERRORS: tuple[type[Exception], ...] = (
+    RuntimeError,
+    ValueError,
+    *(kind for kind in vars(ort_state).values() if isinstance(kind, type) and issubclass(kind, Exception)),
+)
+
+
+@dataclass(frozen=True)
+class Provider:
+    """An execution provider of ONNX Runtime.
+
+    ort_name: its name there. options: what keeps it in float32. choice: the option that picks one of its
+    devices. accelerator: the device that "auto" tries, where the provider's own default may be the CPU.
+    """
+
+    ort_name: str
+    options: Mapping[str, str] = field(default_factory=dict)
+    choice: str = "device_id"
+    accelerator: str = ""
+
+
+# In the order in which "auto" tries them.
+PROVIDERS = {
+    "cuda": Provider("CUDAExecutionProvider", {"use_tf32": "0"}),
+    "migraphx": Provider("MIGraphXExecutionProvider"),
+    "dml": Provider("DmlExecutionProvider"),
+    "coreml": Provider("CoreMLExecutionProvider", {"ModelFormat": "MLProgram"}, "MLComputeUnits"),
+    "webgpu": Provider("WebGpuExecutionProvider"),
+    "openvino": Provider("OpenVINOExecutionProvider", {"precision": "FP32"}, "device_type", "GPU"),
+    "cpu": Provider("CPUExecutionProvider", choice=""),
+}
+
+
+def available() -> list[str]:
+    """The names of the providers that the installed ONNX Runtime was built with; "cpu" is the last."""
+    built = ort.get_available_providers()
+    return [name for name, provider in PROVIDERS.items() if provider.ort_name in built]
+
+
+def accelerators() -> list[str]:
+    """The devices that "auto" tries before the CPU, best first."""
+    choices = {name: PROVIDERS[name].accelerator for name in available() if name != "cpu"}
+    return [f"{name}:{choice}" if choice else name for name, choice in choices.items()]
+
+
+def open_session(model: Path, device: str, threads: int | None) -> ort.InferenceSession:
+    """Load a graph on a device, which takes all of it but the operations that it lacks; the CPU takes those.
+
+    threads: CPU threads for one operation; None leaves it to ONNX Runtime. Raises DeviceError for a device
+    that is not there or cannot be started, BundleError for a file that is no ONNX graph, and InputError for
+    threads below 1.
+    """
+    name, _, choice = device.partition(":")
+    if name not in available() or (choice and not PROVIDERS[name].choice):
+        raise DeviceError(f"There is no device {device!r} here; there is {', '.join(available())}, or auto.")
+    provider, cpu = PROVIDERS[name], PROVIDERS["cpu"]
+    options = {**provider.options, **({provider.choice: choice} if choice else {})}
+    try:
+        session = _start(
+            model, {provider.ort_name: options, cpu.ort_name: {}}, _session_options(name, threads)
+        )
+    except _ORT_ERRORS as error:
+        # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
+        kind = BundleError if name == "cpu" else DeviceError
+        raise kind(f"{device} cannot load {model}: {reason(error)}.") from error
+    if session.get_providers()[0] != provider.ort_name:
+        raise DeviceError(f"{device} could not be started here.")
+    return session
+
+
+@contextlib.contextmanager
+def translated(device: str) -> Iterator[None]:
+    """ONNX Runtime's errors as DeviceError."""
+    try:
+        yield
+    except _ORT_ERRORS as error:
+        raise DeviceError(f"{device} failed: {reason(error)}.") from error
+
+
+def _session_options(name: str, threads: int | None) -> ort.SessionOptions:
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    if threads is not None:
+        if threads < 1:
+            raise InputError(f"threads must be at least 1, not {threads}.")
+        options.intra_op_num_threads = threads
+    if name == "dml":  # DirectML's provider demands both
+        options.enable_mem_pattern = False
+        options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    return options
+
+
+def _start(
+    model: Path, providers: Mapping[str, Mapping[str, str]], options: ort.SessionOptions
+) -> ort.InferenceSession:
+    ort.set_default_logger_severity(
+        4
+    )  # what fails is raised or seen by the caller; no log on the terminal too
+    try:
+        return ort.InferenceSession(str(model), options, providers=list(providers.items()), enable_fallback=0)
+    finally:
+        ort.set_default_logger_severity(2)
