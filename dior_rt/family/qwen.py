@@ -104,7 +104,7 @@ class Qwen:
     def sigmas(self, steps: int, condition: Condition) -> Array:
         """As `Family.sigmas`; InputError where the bundle is for another number of steps."""
         fixed = self.settings.fixed_sigmas
-        if fixed is not None:
+        if fixed:
             if steps != len(fixed):
                 raise InputError(
                     f"This model was exported for {len(fixed)} steps, not {steps}; export it with free steps."
@@ -197,7 +197,7 @@ class Qwen:
         Read from the bundle's table, or computed once for a schedule.
         """
         fixed = self.settings.fixed_sigmas
-        if self._table is not None and fixed is not None:
+        if self._table is not None:
             if len(sigmas) != len(fixed) or np.abs(sigmas - np.array(fixed)).max() > SAME_SIGMA:
                 raise InputError("This model has no modulation for these sigmas; export it with free steps.")
             return self._table
@@ -246,7 +246,7 @@ class Qwen:
 
     def _read_table(self, bundle: Bundle) -> Array | None:
         fixed = self.settings.fixed_sigmas
-        if fixed is None:
+        if not fixed:
             return None
         with _readable(bundle, MODULATION):
             table = np.load(bundle.folder / MODULATION, mmap_mode="r", allow_pickle=False)

@@ -58,10 +58,10 @@ class TextSettings:
 class QwenSettings:
     """The model's sizes.
 
-    area, multiple: the rule for the size of the pictures (pixels). factor: pixels a latent; patch: latents a
-    token, each way. axes: how many of a head's numbers turn with frame, row and column. reference_at_zero:
-    the reference pictures are modulated as at sigma = 0. fixed_sigmas: the only schedule that the bundle has
-    modulation for, or None where it can compute any. lumi_peak: the light that is drawn as white. text: None
+    area, multiple: the rule for the size of the pictures, in pixels. factor: pixels a latent; patch: latents a
+    token, each way. axes: how many of a head's numbers turn with frame, row and column. reference_at_zero: the
+    reference pictures are modulated as at sigma = 0. fixed_sigmas: the only schedule that the bundle has
+    modulation for; empty where it can compute any. lumi_peak: the light that is drawn as white. text: None
     where the prompts' embeddings are in `prompts.npz` themselves.
     """
 
@@ -73,7 +73,7 @@ class QwenSettings:
     axes: tuple[int, ...]
     theta: float
     reference_at_zero: bool
-    fixed_sigmas: tuple[float, ...] | None
+    fixed_sigmas: tuple[float, ...]
     lumi_peak: float
     text: TextSettings | None
 

@@ -57,7 +57,7 @@ class Frame:
 
 
 def resize(pixels: NDArray, size: tuple[int, int], method: Image.Resampling) -> NDArray:
-    """Resize (h, w, 3), uint8 or float32, to (rows, columns) as Pillow does; its own size leaves it as it is."""
+    """Resize (h, w, 3), uint8 or float32, to (rows, columns) as Pillow does; to its own size, not at all."""
     if pixels.shape[:2] == size:
         return pixels
     if pixels.dtype == np.uint8:

@@ -12,6 +12,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 import numpy as np
+
+from dior_rt.bundle import Bundle, Graph, Manifest, write_bundle
+from dior_rt.errors import BundleError
 from dior_rt.export.qwen.errors import check_block, compare
 from dior_rt.export.qwen.graph import Precision
 from dior_rt.export.qwen.lora import Lora
@@ -20,9 +23,6 @@ from dior_rt.export.qwen.sources import MULTIPLE, Prompts, Sources
 from dior_rt.export.qwen.text import write_text_encoder
 from dior_rt.export.qwen.transformer import THETA, write_transformer
 from dior_rt.export.qwen.vae import write_decoder, write_encoder
-
-from dior_rt.bundle import Bundle, Graph, Manifest, write_bundle
-from dior_rt.errors import BundleError
 from dior_rt.family.qwen_config import FILE, MODULATION, PROMPTS, QwenSettings, TextSettings
 from dior_rt.family.qwen_layers import Layers
 from dior_rt.family.qwen_prompt import PromptEncoder
@@ -31,6 +31,7 @@ from dior_rt.sampler import Array
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 AREA: Final = 1024**2
+VISION_AREA: Final = 384**2
 LUMI_PEAK: Final = 4.0
 BYTES: Final = {"fp32": 4.0, "fp16": 2.0, "int8": 1.0, "int4": 0.625}  # a weight
 LIGHTNING_SHIFT: Final = 3.0  # few-step LoRAs are trained with mu = ln 3, whatever the size
@@ -43,12 +44,14 @@ class Recipe:
     """What to make of a model.
 
     precision: of the transformer's blocks and of the text encoder's layers. steps, guidance: what the bundle
-    does unless told otherwise. schedule: None takes the model's. free_steps: keep the weights that compute
-    modulation, a third of the transformer, so that every number of steps and every schedule can be run;
-    without them the bundle is for `steps` alone. prompt_cache: store the prompts' embeddings, computed
-    without the pictures, and leave the text encoder out; for LoRAs that were trained so. area: pixels of the
-    pictures that it paints.
-    probe_area: of the picture by which the error of a precision is measured.
+    does unless told otherwise. schedule: None takes the model's.
+
+    free_steps: keep the weights that compute modulation, a third of the transformer, so that any number of
+    steps can be run; without them the bundle is for `steps` alone. prompt_cache: store the prompts' embeddings,
+    computed without the pictures, and leave the text encoder out; for LoRAs that were trained so.
+
+    area, vision_area: pixels of the pictures that the bundle paints, and that its prompts' encoder sees.
+    probe_area: of the picture by which the cost of a precision is measured.
     """
 
     name: str = "Qwen-Image-Edit"
@@ -61,6 +64,7 @@ class Recipe:
     prompt_cache: bool = False
     prompts: Prompts = field(default_factory=Prompts)
     area: int = AREA
+    vision_area: int = VISION_AREA
     probe_area: int = 256**2
 
     def few_steps(self, steps: int) -> Recipe:
@@ -160,7 +164,7 @@ class _Draft:
         self._add("vae", "encoder", write_encoder(folder / "encoder.onnx", config, weights))
         self._add("vae", "decoder", write_decoder(folder / "decoder.onnx", config, weights))
 
-    def _write_modulation(self) -> tuple[float, ...] | None:
+    def _write_modulation(self) -> tuple[float, ...]:
         """The graphs, or for a bundle of fixed steps their table; returns the sigmas that it is for."""
         config = self.sources.transformer
         folder = self._new("modulation")
@@ -168,7 +172,7 @@ class _Draft:
         if self.recipe.free_steps:
             for name, graph in written:
                 self._add("modulation", name, graph)
-            return None
+            return ()
         sigmas = self._square_sigmas()
         rows = np.append(sigmas, np.float32(0)) if config.zero_cond_t else sigmas
         tabulate(self.folder / MODULATION, rows, folder, written, config)
@@ -188,7 +192,7 @@ class _Draft:
         sources, cache = self.sources, self.recipe.prompt_cache
         said = self.recipe.prompts.each()
         ids = {name: sources.word_ids(words, 0 if cache else shown) for name, (words, shown) in said.items()}
-        settings = sources.text_settings(ids)
+        settings = sources.text_settings(ids, self.recipe.vision_area)
         known = sorted({word for prompt in ids.values() for word in prompt} - {settings.picture_id})
         rows = sources.text_weights.rows("model.embed_tokens.weight", known)
         precision: Precision = "fp32" if cache else self.recipe.precision
@@ -210,7 +214,7 @@ class _Draft:
         shutil.rmtree(self.folder / "text")
         return None
 
-    def _settings(self, fixed: tuple[float, ...] | None, text: TextSettings | None) -> QwenSettings:
+    def _settings(self, fixed: tuple[float, ...], text: TextSettings | None) -> QwenSettings:
         config = self.sources.transformer
         return QwenSettings(
             area=self.recipe.area,

@@ -9,17 +9,17 @@ from typing import Any, Final
 import numpy as np
 import torch
 from diffusers.models.transformers.transformer_qwenimage import QwenImageTransformerBlock
-from dior_rt.export.check import ExportError
-from dior_rt.export.qwen.graph import Precision
-from dior_rt.export.qwen.transformer import THETA, TransformerConfig
-from dior_rt.export.qwen.weights import Weights
-from dior_rt.kernels import Strokes
 from numpy.typing import NDArray
 
 from dior_rt.bundle import Bundle
 from dior_rt.engine import Engine
+from dior_rt.export.check import ExportError
+from dior_rt.export.qwen.graph import Precision
+from dior_rt.export.qwen.transformer import THETA, TransformerConfig
+from dior_rt.export.qwen.weights import Weights
 from dior_rt.family.qwen import Qwen
 from dior_rt.family.qwen_rope import joint_places, turns
+from dior_rt.kernels import Strokes
 from dior_rt.sampler import Array, draw_noise, sample
 
 BLOCK_BAR: Final[dict[Precision, float]] = {

@@ -15,12 +15,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
-from dior_rt.export.qwen.graph import GraphWriter
-from dior_rt.export.qwen.transformer import TransformerConfig
-from dior_rt.export.qwen.weights import Array, Weights
 
 from dior_rt.bundle import Graph
 from dior_rt.engine import Engine
+from dior_rt.export.qwen.graph import GraphWriter
+from dior_rt.export.qwen.transformer import TransformerConfig
+from dior_rt.export.qwen.weights import Array, Weights
 
 WAVES = 256  # half cosines, half sines
 PERIOD = 10000.0

@@ -9,25 +9,24 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
+from transformers import Qwen2Tokenizer
+
+from dior_rt.errors import InputError
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.export.qwen.text import TextConfig
 from dior_rt.export.qwen.transformer import TransformerConfig
 from dior_rt.export.qwen.vae import VaeConfig
 from dior_rt.export.qwen.weights import Checkpoint, Merged, read_config
-from transformers import Qwen2Tokenizer
-
-from dior_rt.errors import InputError
 from dior_rt.family.qwen_config import TextSettings, VisionSettings
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
-VISION_AREA: Final = 384**2
 MULTIPLE: Final = 32
 
 # The words around every prompt that the model was trained with; the embeddings of the first 64 are dropped.
 TEMPLATE: Final = (
     "<|im_start|>system\nDescribe the key features of the input image (color, shape, size, texture, objects, "
-    "background), then explain how the user's text instruction should alter or modify the image. Generate a "
-    "new image that meets the user's requirements while maintaining consistency with the original input where "
+    "background), then explain how the user's text instruction should alter or modify the image. "
+    "Generate a new image that meets the user's requirements while maintaining consistency with the original input where "
     "appropriate."
     "<|im_end|>\n<|im_start|>user\n{}<|im_end|>\n<|im_start|>assistant\n"
 )
@@ -75,7 +74,7 @@ class Sources:
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path} describes no schedule that this export knows: {error}.") from error
 
-    def text_settings(self, prompts: dict[str, tuple[int, ...]]) -> TextSettings:
+    def text_settings(self, prompts: dict[str, tuple[int, ...]], vision_area: int) -> TextSettings:
         """What the runtime has to know to run the text encoder on these prompts."""
         text, vision = self.text.text, self.text.vision
         seen = read_config(self.folder / "processor" / "preprocessor_config.json")
@@ -89,7 +88,7 @@ class Sources:
             theta=float(text.rope_parameters["rope_theta"]),
             sections=tuple(text.rope_parameters["mrope_section"]),
             vision=VisionSettings(
-                area=VISION_AREA,
+                area=vision_area,
                 multiple=MULTIPLE,
                 least_pixels=int(seen.get("min_pixels") or limits["shortest_edge"]),
                 most_pixels=int(seen.get("max_pixels") or limits["longest_edge"]),
@@ -117,6 +116,8 @@ class Sources:
 
     def _picture_id(self) -> int:
         word: Any = self._tokenizer.convert_tokens_to_ids("<|image_pad|>")
+        if word is None:
+            raise InputError(f"The tokenizer of {self.folder} does not know the word for a picture.")
         return int(word)
 
     def word_ids(self, prompt: str, pictures: int) -> tuple[int, ...]:

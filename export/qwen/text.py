@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dior_rt.export.qwen.graph import GraphWriter, Precision
-from dior_rt.export.qwen.weights import Checkpoint
 from transformers import Qwen2_5_VLConfig
 
 from dior_rt.bundle import Graph
 from dior_rt.errors import InputError
+from dior_rt.export.qwen.graph import GraphWriter, Precision
+from dior_rt.export.qwen.weights import Checkpoint
 
 VISION_EPS = 1e-6  # as in the model's code; its config has none
 OUT_OF_GROUP = -1e9  # added to a score, leaves nothing of it

@@ -18,11 +18,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dior_rt.export.qwen.graph import GraphWriter, Precision
-from dior_rt.export.qwen.weights import Weights, read_config
-
 from dior_rt.bundle import Graph
 from dior_rt.errors import InputError
+from dior_rt.export.qwen.graph import GraphWriter, Precision
+from dior_rt.export.qwen.weights import Weights, read_config
 
 EPS = 1e-6
 THETA = 10000.0  # of the rotary positions; its config has none

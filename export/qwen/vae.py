@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from dior_rt.export.qwen.graph import GraphWriter
-from dior_rt.export.qwen.weights import Checkpoint, read_config
 
 from dior_rt.bundle import Graph
 from dior_rt.errors import InputError
+from dior_rt.export.qwen.graph import GraphWriter
+from dior_rt.export.qwen.weights import Checkpoint, read_config
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class _Net:
         )
 
     def conv(self, x: str, at: str, stride: int = 1) -> str:
-        """A convolution that keeps the size or, with a stride of 2 and padding at the far edges, halves it."""
+        """A convolution that keeps the size or, with a stride of 2 and padding at the far edges, halves."""
         weight = self.weights[f"{at}.weight"]
         if weight.ndim == 5:
             weight = weight[:, :, -1]

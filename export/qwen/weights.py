@@ -9,11 +9,11 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from dior_rt.export.qwen.lora import Lora
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from dior_rt.errors import InputError
+from dior_rt.export.qwen.lora import Lora
 
 Array = NDArray[np.float32]
 

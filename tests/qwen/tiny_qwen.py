@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -150,7 +151,18 @@ def pipeline(
         transformer=transformer(zero_cond_t=zero_cond_t),
     )
     pipe.set_progress_bar_config(disable=True)
+    pipe.text_encoder.register_forward_pre_hook(_tell_pictures_from_words, with_kwargs=True)
     return pipe
+
+
+def _tell_pictures_from_words(encoder: Any, args: Any, kwargs: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """Pass on which tokens are pictures.
+
+    diffusers drops it, and transformers since 5 then places a picture's tokens in a row, like words, where the
+    model was trained to place them in a grid: https://github.com/huggingface/diffusers/issues/14194.
+    """
+    kwargs["mm_token_type_ids"] = (kwargs["input_ids"] == encoder.config.image_token_id).int()
+    return args, kwargs
 
 
 def save(pipe: QwenImageEditPlusPipeline, folder: Path, *, shard: str = "60KB") -> Path:
