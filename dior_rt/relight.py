@@ -151,7 +151,7 @@ class Relighter:
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
         drawn = self._ops.reduce_strokes(light, mask, raster)
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
         if not np.isfinite(drawn.light).all():
             raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
