@@ -1,0 +1,77 @@
+"""The sRGB curve of IEC 61966-2-1, as a float64 definition and as the tables that every device reads.
+
+    decode(v) = v / 12.92                     for v <= 0.04045,      ((v + 0.055) / 1.055) ** 2.4   above
+    encode(x) = 12.92 * x                     for x <= 0.0031308,    1.055 * x ** (1 / 2.4) - 0.055 above
+
+Both extend beyond 0..1 by the same formulas: the line below 0, the power above 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import numpy.typing as npt
+
+from dior_rt.kernels.types import FloatArray
+
+#: Where the line meets the power, on the encoded and on the linear side.
+ENCODED_KNEE = 0.04045
+LINEAR_KNEE = 0.0031308
+
+
+def srgb_to_linear(encoded: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """decode(v) in float64."""
+    v = np.asarray(encoded, np.float64)
+    power = ((np.maximum(v, ENCODED_KNEE) + 0.055) / 1.055) ** 2.4
+    return np.where(v <= ENCODED_KNEE, v / 12.92, power)
+
+
+def linear_to_srgb(linear: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """encode(x) in float64."""
+    x = np.asarray(linear, np.float64)
+    power = 1.055 * np.maximum(x, LINEAR_KNEE) ** (1 / 2.4) - 0.055
+    return np.where(x <= LINEAR_KNEE, 12.92 * x, power)
+
+
+@cache
+def decode_table(dtype: np.dtype[np.unsignedinteger]) -> FloatArray:
+    """The linear value of every code of uint8 or uint16, float32, one entry a code."""
+    codes = np.arange(np.iinfo(dtype).max + 1)
+    table = srgb_to_linear(codes / codes[-1]).astype(np.float32)
+    table.setflags(write=False)
+    return table
+
+
+@dataclass(frozen=True)
+class EncodeTable:
+    """Rounds linear float32 to the nearest sRGB code without computing a power, exactly.
+
+    A float's upper bits name a bucket so narrow that at most one rounding threshold lies in it. Of a value x,
+    clipped to floor..1: bucket = (bits(x) >> shift) - first; code = start[bucket]; and one more where
+    x >= threshold[code]. threshold[k] is the smallest float32 that rounds to code k + 1.
+    """
+
+    shift: int
+    first: int
+    floor: np.float32
+    start: npt.NDArray[np.unsignedinteger]
+    threshold: FloatArray
+
+
+@cache
+def encode_table(dtype: np.dtype[np.unsignedinteger]) -> EncodeTable:
+    """The table for uint8 or uint16."""
+    top = int(np.iinfo(dtype).max)
+    exact = srgb_to_linear((np.arange(top) + 0.5) / top)
+    threshold = exact.astype(np.float32)
+    threshold = np.where(threshold < exact, np.nextafter(threshold, np.float32(2)), threshold)
+    shift = 16 if top == 255 else 8
+    floor = np.float32(2.0 ** np.floor(np.log2(exact[0])))
+    first = int(floor.view(np.uint32)) >> shift
+    last = int(np.float32(1).view(np.uint32)) >> shift
+    buckets = (np.arange(first, last + 1, dtype=np.uint32) << np.uint32(shift)).view(np.float32)
+    start = np.searchsorted(threshold, buckets, side="right").astype(dtype)
+    threshold = np.append(threshold, np.float32(np.inf)).astype(np.float32)
+    return EncodeTable(shift, first, floor, start, threshold)

@@ -1,0 +1,40 @@
+"""Exact area resampling: how much of each input pixel an output cell covers, along one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from dior_rt.kernels.types import FloatArray
+
+#: Rows are worked on in bands of about this many pixels, so that memory stays bounded.
+BAND_PIXELS = 1 << 18
+
+
+def bands(height: int, width: int) -> Iterator[slice]:
+    """Slices of rows, in order, of about BAND_PIXELS pixels each and at least one row."""
+    rows = max(1, BAND_PIXELS // width)
+    for top in range(0, height, rows):
+        yield slice(top, min(height, top + rows))
+
+
+def area_weights(pixels: int, cells: int) -> FloatArray:
+    """(cells, pixels) float32: the share of cell i that pixel j fills. Every row sums to 1.
+
+    Cell i spans [i, i + 1) * pixels / cells. The overlaps are computed in units of 1 / cells, as integers, so
+    a pixel that a cell does not touch weighs exactly 0.
+    """
+    cell = np.arange(cells, dtype=np.int64)[:, None] * pixels
+    pixel = np.arange(pixels, dtype=np.int64)[None, :] * cells
+    overlap = np.minimum(cell + pixels, pixel + cells) - np.maximum(cell, pixel)
+    return (np.maximum(overlap, 0) / pixels).astype(np.float32)
+
+
+def taps(pixels: int, cells: int) -> tuple[np.ndarray, np.ndarray, FloatArray]:
+    """Where pixels lie between the centres of cells: (lower cell, upper cell, weight of the upper)."""
+    at = (np.arange(pixels) + 0.5) * (cells / pixels) - 0.5
+    at = np.clip(at, 0, cells - 1)
+    lower = np.minimum(at.astype(np.int64), max(cells - 2, 0))
+    upper = np.minimum(lower + 1, cells - 1)
+    return lower, upper, (at - lower).astype(np.float32)

@@ -1,0 +1,59 @@
+"""The words of the kernels: a stroke as drawn, strokes as a raster, and what goes wrong."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float32]
+Picture = npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]
+
+
+class KernelError(ValueError):
+    """A device that was asked for by name and is not there, or that computes wrong results."""
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """One pull of the brush: a polyline with round caps; a single point is a dot.
+
+    points: ((x, y), ...) in pixels; (0, 0) is the upper left corner of the picture, (0.5, 0.5) the centre of
+    its first pixel; points may lie outside. width: pixels, > 0. color: linear RGB. intensity: the light is
+    color * intensity, both >= 0. softness: the share of the half width over which the edge fades, 0 hard ..
+    1.
+    """
+
+    points: tuple[tuple[float, float], ...]
+    width: float
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    intensity: float = 1.0
+    softness: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.points or any(len(point) != 2 for point in self.points):
+            raise ValueError("a stroke needs at least one point, each an (x, y) pair")
+        if not all(math.isfinite(value) for point in self.points for value in point):
+            raise ValueError("a stroke's points must be finite")
+        if not (math.isfinite(self.width) and self.width > 0):
+            raise ValueError(f"a stroke's width must be a positive number of pixels, not {self.width}")
+        if len(self.color) != 3 or not all(math.isfinite(c) and c >= 0 for c in self.light):
+            raise ValueError("a stroke's color must be three finite numbers >= 0, and its intensity one")
+        if not 0 <= self.softness <= 1:
+            raise ValueError(f"a stroke's softness must lie in 0..1, not {self.softness}")
+
+    @property
+    def light(self) -> tuple[float, ...]:
+        """The linear RGB that the stroke says falls here: color * intensity."""
+        return tuple(c * self.intensity for c in self.color)
+
+
+@dataclass(frozen=True)
+class Strokes:
+    """A sparse Lumi map. light: (H, W, 3) float32 linear RGB >= 0; mask: (H, W) float32 in 0..1, 0 =
+    unspecified."""
+
+    light: FloatArray
+    mask: FloatArray
