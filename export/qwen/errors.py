@@ -29,6 +29,7 @@ BLOCK_BAR: Final[dict[Precision, float]] = {
     "int4": 0.5,
 }  # relative, per block
 WORDS: Final = 5
+MEMORY: Final = 4 << 30  # of weights that stay loaded while a bundle is measured, however large it is
 SIZES: Final = ((4, 6), (4, 6), (4, 6))
 
 
@@ -136,7 +137,7 @@ def compare(bundle: Bundle, reference: Bundle, area: int) -> dict[str, float]:
 
 def _trace(bundle: Bundle, area: int) -> tuple[Array, Array, Array]:
     """The first velocity, the last state and the picture of a run on a fixed picture and strokes."""
-    qwen, manifest = Qwen(bundle, "cpu", memory=0, area=area), bundle.manifest
+    qwen, manifest = Qwen(bundle, "cpu", memory=MEMORY, area=area), bundle.manifest
     side = round(math.sqrt(area))
     raster = qwen.raster(side, side)
     condition = qwen.encode(probe_photo(raster), probe_strokes(raster), "relight")

@@ -107,7 +107,7 @@ def test_windows_follow_transformers(qwens, grids):
 def test_word_ids_are_those_of_the_processor(folders, pipes):
     ids = Sources(folders[True]).word_ids(WORDS, pictures=2)
     text = TEMPLATE.format(PICTURE.format(1) + PICTURE.format(2) + WORDS)
-    assert TEMPLATE == pipes[True].prompt_template_encode
+    assert pipes[True].prompt_template_encode == TEMPLATE
     assert list(ids) == pipes[True].tokenizer(text)["input_ids"]
 
 

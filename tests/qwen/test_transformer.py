@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tiny_qwen
 import torch
+from agreement_qwen import call_both
 
 from dior_rt.bundle import read_bundle
 from dior_rt.engine import Engine
@@ -17,28 +18,6 @@ from dior_rt.family.qwen_rope import joint_places, turns
 
 # What one call may cost, relative to the output's norm, on random weights.
 BARS = {"fp32": 1e-5, "fp16": 2e-3, "int8": 5e-2, "int4": 2e-1}
-
-
-def call_both(qwen, pipe, sigma, words, sizes, seed=0, mask=False):
-    """The velocity of random latents, by diffusers and by the bundle."""
-    random = np.random.default_rng(seed)
-    counts = [rows * columns for rows, columns in sizes]
-    x, references = (random.standard_normal((n, 16), dtype=np.float32) for n in (counts[0], sum(counts[1:])))
-    text = random.standard_normal((words, 32), dtype=np.float32)
-    with torch.no_grad():
-        want = pipe.transformer(
-            torch.from_numpy(np.concatenate([x, references]))[None],
-            torch.from_numpy(text)[None],
-            torch.ones(1, words) if mask else None,
-            torch.tensor([sigma]),
-            [[(1, *size) for size in sizes]],
-            return_dict=False,
-        )[0]
-    frame = Frame.around((32, 32), 32)
-    condition = Condition("relight", (32, 32), frame, references, tuple(sizes), ())
-    modulation = qwen.modulation(np.array([sigma], np.float32))
-    got = qwen.predict(x, condition, [text], modulation)[0]
-    return got, want[0, : counts[0]].numpy()
 
 
 @pytest.mark.parametrize("zero", [False, True])

@@ -158,8 +158,8 @@ def pipeline(
 def _tell_pictures_from_words(encoder: Any, args: Any, kwargs: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Pass on which tokens are pictures.
 
-    diffusers drops it, and transformers since 5 then places a picture's tokens in a row, like words, where the
-    model was trained to place them in a grid: https://github.com/huggingface/diffusers/issues/14194.
+    diffusers drops it, and transformers from 5 on then places a picture's tokens in a row, like words, where
+    the model was trained to place them in a grid: https://github.com/huggingface/diffusers/issues/14194.
     """
     kwargs["mm_token_type_ids"] = (kwargs["input_ids"] == encoder.config.image_token_id).int()
     return args, kwargs
