@@ -197,11 +197,13 @@ def _interpret_image(image: Image.Image) -> tuple[Pixels | None, Coloured]:
             return None, Coloured(np.asarray(image.convert("RGB")))
         return None, Coloured(np.asarray(convert_to_srgb(image, icc)), icc=srgb_profile())
     grey = image.mode in ("1", "L", "LA", "La")
-    if image.has_transparency_data:
-        samples = np.asarray(image.convert("LA" if grey else "RGBA"))
+    transparent = image.has_transparency_data
+    mode = ("L", "LA", "RGB", "RGBA")[2 * (not grey) + transparent]
+    samples = np.asarray(image if image.mode == mode else image.convert(mode))
+    samples = samples.reshape(*samples.shape[:2], len(mode))
+    if transparent:
         return samples[..., -1], interpret(samples[..., :-1], icc)
-    samples = np.asarray(image.convert("L" if grey else "RGB"))
-    return None, interpret(samples[..., None] if grey else samples, icc)
+    return None, interpret(samples, icc)
 
 
 def _interpret_deep(samples: np.ndarray, info: Mapping[Any, Any]) -> tuple[Pixels | None, Coloured]:

@@ -115,10 +115,14 @@ def test_no_part_is_importable_by_its_bare_name(installed: Path, tmp_path: Path)
 
 
 def test_a_command_without_its_extra_names_the_extra(installed: Path, tmp_path: Path) -> None:
-    cases = {("export", "checkpoint", "-o", "bundle"): "export", ("train", "--help"): "train"}
+    cases = {
+        ("export", "checkpoint", "-o", "bundle"): "export",
+        ("train", "render", "--out", "scenes"): "train",
+    }
     for arguments, extra in cases.items():
         result = run(installed / "dior-rt", *arguments, cwd=tmp_path)
         assert result.returncode == 2
         sentence = f"dior-rt: `dior-rt {extra}` needs more packages: pip install 'dior-rt[{extra}]'.\n"
         assert result.stderr == sentence
-    assert "train" in run(installed / "dior-rt", "--help", cwd=tmp_path).stdout
+    assert list(tmp_path.iterdir()) == []
+    assert "render" in run(installed / "dior-rt", "train", "--help", cwd=tmp_path).stdout

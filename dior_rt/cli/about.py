@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from dior_rt.cli import options
-from dior_rt.errors import MissingExtraError
+from dior_rt.cli.extras import needs_extra
 
 
 def info(
@@ -66,14 +66,10 @@ def export(
     \b
       dior-rt export runs/mini/step-9000 --lora runs/mini-lora -o bundles/mini
     """
-    try:
+    with needs_extra("export"):
         from dior_rt.export import export_checkpoint
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("dior_rt"):
-            raise
-        raise MissingExtraError("export", "export") from error
 
-    bundle = export_checkpoint(checkpoint, out, lora=lora, weights=weights, overwrite=overwrite)
+        bundle = export_checkpoint(checkpoint, out, lora=lora, weights=weights, overwrite=overwrite)
     _table([(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()])
 
 

@@ -10,7 +10,7 @@ from typer.core import TyperGroup
 
 from dior_rt import __version__
 from dior_rt.cli import about, pictures
-from dior_rt.errors import MissingExtraError
+from dior_rt.cli.extras import needs_extra
 
 app = typer.Typer(
     name="dior-rt",
@@ -48,22 +48,23 @@ class TrainGroup(TyperGroup):
         """One of them, or None."""
         return _training().get_command(ctx, cmd_name)
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run one of them."""
+        with needs_extra("train"):
+            return super().invoke(ctx)
+
+
+@cache
+def _training() -> TyperGroup:
+    from dior_rt.training.cli import app as training
+
+    group = typer.main.get_command(training)
+    assert isinstance(group, TyperGroup)
+    return group
+
 
 app.add_typer(
     typer.Typer(cls=TrainGroup),
     name="train",
     help="Render scenes, train models, evaluate them.",
 )
-
-
-@cache
-def _training() -> TyperGroup:
-    try:
-        from dior_rt.training.cli import app as training
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("dior_rt"):
-            raise
-        raise MissingExtraError("train", "train") from error
-    group = typer.main.get_command(training)
-    assert isinstance(group, TyperGroup)
-    return group

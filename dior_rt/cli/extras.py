@@ -1,0 +1,19 @@
+"""Commands whose packages come with an extra."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from dior_rt.errors import MissingExtraError
+
+
+@contextmanager
+def needs_extra(name: str) -> Iterator[None]:
+    """Turn a package that is missing in the block into MissingExtraError; name: of command and extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] == "dior_rt":  # ours is never missing but by mistake
+            raise
+        raise MissingExtraError(name, name) from error
