@@ -1,0 +1,191 @@
+"""Mini's network: a plain diffusion transformer on the light grid that predicts light, not colours.
+
+Its heads are physical. To relight it predicts a log-ratio r of light a cell and channel,
+
+    relit = (photo + e) exp(r) - e        in linear light, e = 0.02
+
+so a network that has learnt nothing returns the photo, and black can still be lit. To estimate it predicts the
+encoded Lumi map as a change of the encoded photo. Both become x0, and the velocity is v = (x - x0) / sigma.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
+RELIT_SCALE = 4.0
+LUMI_SCALE = 8.0
+SMALLEST_SIGMA = 1e-3
+
+
+@dataclass(frozen=True)
+class Config:
+    """The network's size. width: of a token, a multiple of 4 * heads; patch: cells a side that share a token."""
+
+    width: int = 192
+    depth: int = 6
+    heads: int = 6
+    patch: int = 4
+    features: int = 24  # a cell, between the transformer and the output's convolutions
+
+
+def srgb_to_linear(encoded: Tensor) -> Tensor:
+    """IEC 61966-2-1, for values in 0..1."""
+    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded.clamp_min(0.04) + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: Tensor) -> Tensor:
+    """IEC 61966-2-1, for values in 0..1; its straight foot goes on below 0."""
+    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055)
+
+
+def encode_light(light: Tensor) -> Tensor:
+    """log(1 + 8 L) / log 9: 0 to 0, 1 to 1, and room for light a thousand times stronger."""
+    return torch.log1p(LUMI_SCALE * light) / math.log1p(LUMI_SCALE)
+
+
+def decode_light(encoded: Tensor) -> Tensor:
+    return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
+
+
+class Mini(nn.Module):
+    """photo, strokes, noisy state -> velocity. Inputs and output as in docs/contracts.md."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = config
+        width, patch = config.width, config.patch
+        self.embed = nn.Conv2d(10, width, patch, patch)
+        self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.mode = nn.Embedding(2, width)
+        self.modulation = nn.Linear(width, 6 * width)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
+        self.unembed = nn.Linear(width, config.features * patch * patch)
+        self.smooth = nn.Conv2d(config.features + 10, config.features, 3, padding=1)
+        self.head = nn.Conv2d(config.features, 6, 3, padding=1)
+        for silent in (self.modulation, self.head):
+            nn.init.zeros_(silent.weight)
+            nn.init.zeros_(silent.bias)
+
+    def forward(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor) -> Tensor:
+        x0 = self.predict(x, sigma, photo, light, mask, mode)
+        return (x - x0) / sigma.clamp_min(SMALLEST_SIGMA)[:, None, None, None]
+
+    def predict(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor) -> Tensor:
+        """x0, (B, 3, h, w)."""
+        seen = torch.cat([x, 2 * photo - 1, encode_light(light) * mask, mask], dim=1)  # (B, 10, h, w)
+        cells = self._cells(seen, sigma, mode)
+        relit, lumi = self.head(F.silu(self.smooth(torch.cat([cells, seen], dim=1)))).float().chunk(2, dim=1)
+        return torch.where(mode[:, None, None, None] == 0, _relight(photo, relit), _estimate(photo, lumi))
+
+    def _cells(self, seen: Tensor, sigma: Tensor, mode: Tensor) -> Tensor:
+        """The transformer's features of every cell, (B, features, h, w)."""
+        patch = self.config.patch
+        tokens = self.embed(seen)  # (B, width, rows, columns)
+        rows, columns = tokens.shape[2:]
+        turns = rotations(rows, columns, self.config.width // self.config.heads, seen.device)
+        tokens = tokens.flatten(2).transpose(1, 2)  # (B, rows * columns, width)
+        condition = self.time(waves(sigma, self.config.width)) + self.mode(mode)
+        modulation = self.modulation(F.silu(condition)).unflatten(1, (6, -1))  # (B, 6, width)
+        for block in self.blocks:
+            tokens = block(tokens, modulation, turns)
+        cells = self.unembed(F.layer_norm(tokens, tokens.shape[-1:]))
+        return F.pixel_shuffle(cells.transpose(1, 2).unflatten(2, (rows, columns)), patch)
+
+
+class Block(nn.Module):
+    """Attention and MLP under adaptive norms; one modulation is shared by all blocks, each adds its own offset."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        width = config.width
+        self.heads = config.heads
+        self.offset = nn.Parameter(torch.zeros(6, width))
+        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.up, self.down = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+
+    def forward(self, tokens: Tensor, modulation: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
+        shift1, scale1, gate1, shift2, scale2, gate2 = (modulation + self.offset).unsqueeze(2).unbind(1)
+        tokens = tokens + gate1 * self._attend(_norm(tokens) * (1 + scale1) + shift1, turns)
+        hidden = F.gelu(self.up(_norm(tokens) * (1 + scale2) + shift2), approximate="tanh")
+        return tokens + gate2 * self.down(hidden)
+
+    def _attend(self, tokens: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
+        q, k, v = self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)  # (B, H, N, d)
+        # Queries and keys of unit length keep the logits bounded, whatever the precision.
+        q, k = (rotate(_unit(part), turns).to(v.dtype) for part in (q, k))
+        mixed = F.scaled_dot_product_attention(q, k, v, scale=8.0)
+        return self.proj(mixed.transpose(1, 2).flatten(2))
+
+
+def _norm(tokens: Tensor) -> Tensor:
+    return F.layer_norm(tokens, tokens.shape[-1:])
+
+
+def _unit(part: Tensor) -> Tensor:
+    part = part.float()
+    return part * torch.rsqrt(part.square().sum(-1, keepdim=True) + 1e-6)
+
+
+def waves(sigma: Tensor, width: int) -> Tensor:
+    """(B,) flow times to (B, width) sinusoids, from one turn over 0..1 to a thousand."""
+    frequency = torch.exp(torch.linspace(0.0, math.log(1000.0), width // 2, device=sigma.device))
+    angle = sigma[:, None] * frequency
+    return torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)
+
+
+def rotations(rows: int, columns: int, size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Cosine and sine (rows * columns, size / 2) of the rotary position code: half of it turns with the row, half
+    with the column (RoPE, arXiv 2104.09864, along two axes). Nothing is learnt, so any shape of grid works."""
+    frequency = torch.exp(-math.log(100.0) * torch.arange(size // 4, device=device) / (size // 4))
+    down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(rows, columns, size // 4)
+    along = (torch.arange(columns, device=device)[:, None] * frequency)[None, :, :].expand(rows, columns, size // 4)
+    angle = torch.cat([down, along], dim=2).reshape(rows * columns, size // 2)
+    return torch.cos(angle), torch.sin(angle)
+
+
+def rotate(part: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
+    """Turn the pairs (part[i], part[i + size / 2]) of (B, H, N, size) by their position's angles."""
+    cosine, sine = turns
+    a, b = part.chunk(2, dim=-1)
+    return torch.cat([a * cosine - b * sine, a * sine + b * cosine], dim=-1)
+
+
+def _relight(photo: Tensor, raw: Tensor) -> Tensor:
+    ratio = 6 * torch.tanh(raw / 6)  # at most 400 times the light, or a 400th
+    relit = (srgb_to_linear(photo) + FLOOR) * torch.exp(ratio) - FLOOR
+    # What lies outside the display's range is shown clipped, but a little slope keeps it trainable.
+    shown = relit.clamp(0, 1)
+    return RELIT_SCALE * (linear_to_srgb(shown) + 0.05 * (relit - shown).clamp(-1, 1) - photo)
+
+
+def _estimate(photo: Tensor, raw: Tensor) -> Tensor:
+    return 2 * (encode_light(srgb_to_linear(photo)) + raw) - 1
+
+
+def save_network(network: Mini, path: Path) -> None:
+    """Weights as safetensors, the configuration in its header; written whole or not at all."""
+    partial = path.with_suffix(".partial")
+    weights = {name: weight.contiguous() for name, weight in network.state_dict().items()}
+    save_file(weights, partial, metadata={"config": json.dumps(asdict(network.config))})
+    partial.replace(path)
+
+
+def load_network(path: Path) -> Mini:
+    """The network of a safetensors file written by `save_network`; half-precision weights become float32.
+
+    Raises OSError, SafetensorError, KeyError, TypeError or ValueError for a file that is something else.
+    """
+    with safe_open(path, "pt") as file:
+        network = Mini(Config(**json.loads((file.metadata() or {})["config"])))
+    network.load_state_dict({name: weight.float() for name, weight in load_file(path).items()})
+    return network.eval()

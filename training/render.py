@@ -1,0 +1,242 @@
+"""Renders: every source of a scene alone, as a picture with the scene's materials and as a Lumi map.
+
+A Lumi map is the light that a white matte surface of albedo 1 in each surface's place sends back, straight from the
+source and nothing bounced:
+
+    L(p) = (1 / pi) * integral over the hemisphere at x_p of  L_src(x_p, w) * max(n . w, 0) dw
+
+which is what a direct-light integrator returns when every surface is a diffuse reflector of reflectance 1.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dior_rt.training.scenes import Camera, Material, Mesh, Scene, Source, Thing, scene
+
+RESOLUTION = 96
+SAMPLES = 8
+BOUNCES = 4
+VIEWS = 2  # a scene
+FORMAT = 1
+
+
+def mitsuba() -> Any:
+    """The renderer, in the variant that needs nothing but its wheel.
+
+    Shards, one process a core, use all cores; the LLVM variant compiles anew for most scenes, which costs at these
+    sizes what it gains.
+    """
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("scalar_rgb")
+        mi.set_log_level(mi.LogLevel.Error)
+    return mi
+
+
+@dataclass(frozen=True)
+class View:
+    """One scene from one camera. images, lumi: (sources, H, W, 3) linear float16, each source alone at unit scale;
+    the last source is the dome. kinds: each source's kind. A source's unit is such that its Lumi map's mean is 1/4."""
+
+    images: NDArray[np.float16]
+    lumi: NDArray[np.float16]
+    kinds: tuple[str, ...]
+    scene_kind: str
+    seed: int
+
+    def save(self, path: Path) -> None:
+        """Written whole or not at all."""
+        head = {"format": FORMAT, "kinds": self.kinds, "scene_kind": self.scene_kind, "seed": self.seed}
+        partial = path.with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez(file, images=self.images, lumi=self.lumi, head=np.array(json.dumps(head)))
+        partial.replace(path)
+
+    @staticmethod
+    def load(path: Path) -> View:
+        with np.load(path, allow_pickle=False) as stored:
+            head = json.loads(str(stored["head"]))
+            if head["format"] != FORMAT:
+                raise ValueError(f"{path} was rendered by another version; render it again")
+            kinds = tuple(head["kinds"])
+            return View(stored["images"], stored["lumi"], kinds, head["scene_kind"], head["seed"])
+
+
+def render_scenes(
+    out: Path, scenes: int, seed: int, shard: tuple[int, int] = (0, 1), progress: Callable[[int, int], None] | None = None
+) -> None:
+    """Render the scenes of this shard (index, count) that are not there yet, two views each, to `out/<scene>-<view>.npz`.
+
+    Scene numbers are seed * 1,000,000 + k for k in 0 .. scenes - 1, so that sets of different seeds never share one.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    index, count = shard
+    mine = [seed * 1_000_000 + k for k in range(index, scenes, count)]
+    for done, number in enumerate(mine):
+        paths = [out / f"{number:09d}-{v}.npz" for v in range(VIEWS)]
+        if not all(path.exists() for path in paths):
+            described = scene(number, VIEWS)
+            stage = Stage.load(described.things)
+            for path, camera in zip(paths, described.cameras, strict=True):
+                view(stage, described, camera, number).save(path)
+        if progress:
+            progress(done + 1, len(mine))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The things of a scene in the renderer, as they are and as white matte ones; loading costs as much as a render."""
+
+    original: dict[str, Any]
+    white: dict[str, Any]
+
+    @staticmethod
+    def load(things: tuple[Thing, ...]) -> Stage:
+        return Stage(_load(things, _bsdf), _load(things, _white))
+
+
+def view(
+    stage: Stage, described: Scene, camera: Camera, seed: int, resolution: int = RESOLUTION, samples: int = SAMPLES
+) -> View:
+    """Render one camera's view of every source, original and white."""
+    images, lumi = [], []
+    for k, source in enumerate(described.sources):
+        rays = 2 * samples if source.kind == "dome" else samples  # most of the dome's rays are blocked
+        light = lumi_map(stage, camera, source, resolution, rays, seed=k)
+        image = picture(stage, camera, source, resolution, rays, seed=k)
+        # A source's strength is arbitrary until triplets mix it; a common mean keeps half floats in their good range.
+        unit = 0.25 / max(float(light.mean()), 1e-6)
+        images.append(_half(image * unit))
+        lumi.append(_half(light * unit))
+    kinds = tuple(source.kind for source in described.sources)
+    return View(np.stack(images), np.stack(lumi), kinds, described.kind, seed)
+
+
+def _half(raster: NDArray[np.float32]) -> NDArray[np.float16]:
+    return np.clip(np.nan_to_num(raster), 0, 6e4).astype(np.float16)
+
+
+def picture(
+    stage: Stage, camera: Camera, source: Source, resolution: int, samples: int, seed: int = 0
+) -> NDArray[np.float32]:
+    """(H, W, 3) linear radiance with the scene's own materials and bounced light."""
+    integrator = {"type": "path", "max_depth": BOUNCES, "hide_emitters": True}
+    return _render(stage.original, camera, source, integrator, resolution, samples, seed)
+
+
+def lumi_map(
+    stage: Stage, camera: Camera, source: Source, resolution: int, samples: int, seed: int = 0
+) -> NDArray[np.float32]:
+    """(H, W, 3) the Lumi map of one source of radiance 1: white matte surfaces, direct light only."""
+    integrator = {"type": "direct", "hide_emitters": True}
+    return _render(stage.white, camera, source, integrator, resolution, samples, seed)
+
+
+def _render(
+    shapes: dict[str, Any],
+    camera: Camera,
+    source: Source,
+    integrator: dict[str, Any],
+    resolution: int,
+    samples: int,
+    seed: int,
+) -> NDArray[np.float32]:
+    mi = mitsuba()
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": integrator,
+            "sensor": _sensor(camera, resolution),
+            "source": _emitter(source),
+            **shapes,
+        }
+    )
+    return np.array(mi.render(loaded, spp=samples, seed=seed), dtype=np.float32)[..., :3]
+
+
+def _load(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> dict[str, Any]:
+    mi = mitsuba()
+    return {f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)}
+
+
+def _mesh(mesh: Mesh, bsdf: Any) -> Any:
+    mi = mitsuba()
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    loaded = mi.Mesh(
+        "mesh",
+        vertex_count=len(mesh.vertices),
+        face_count=len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(loaded)
+    parameters["vertex_positions"] = mesh.vertices.ravel()
+    parameters["vertex_texcoords"] = mesh.uv.ravel()
+    parameters["faces"] = mesh.faces.ravel()
+    parameters.update()
+    return loaded
+
+
+def _white(_: Material) -> dict[str, Any]:
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}}
+
+
+def _bsdf(material: Material) -> dict[str, Any]:
+    mi = mitsuba()
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(material.reflectance), "raw": True}
+    surface: dict[str, Any]
+    if material.finish == "matte":
+        surface = {"type": "diffuse", "reflectance": bitmap}
+    elif material.finish == "plastic":
+        surface = {"type": "roughplastic", "diffuse_reflectance": bitmap, "alpha": material.roughness}
+    else:
+        surface = {"type": "roughconductor", "specular_reflectance": bitmap, "alpha": material.roughness}
+    return {"type": "twosided", "bsdf": surface}
+
+
+def _sensor(camera: Camera, resolution: int) -> dict[str, Any]:
+    mi = mitsuba()
+    return {
+        "type": "perspective",
+        "fov": float(camera.fov),
+        "to_world": mi.ScalarTransform4f().look_at(
+            origin=camera.at.tolist(), target=camera.target.tolist(), up=[0, 1, 0]
+        ),
+        "film": {
+            "type": "hdrfilm",
+            "width": resolution,
+            "height": resolution,
+            "pixel_format": "rgb",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent"},
+    }
+
+
+def _emitter(source: Source) -> dict[str, Any]:
+    mi = mitsuba()
+    radiance = {"type": "rgb", "value": 1.0}
+    area = {"type": "area", "radiance": radiance}
+    if source.kind == "dome":
+        return {"type": "constant", "radiance": radiance}
+    if source.kind == "sphere":
+        return {"type": "sphere", "center": source.at.tolist(), "radius": source.size, "emitter": area}
+    to_world = mi.ScalarTransform4f().look_at(
+        origin=source.at.tolist(), target=source.target.tolist(), up=[0.0123, 1, 0.0321]
+    )
+    if source.kind == "spot":
+        return {"type": "spot", "to_world": to_world, "intensity": radiance, "cutoff_angle": source.size}
+    return {"type": "rectangle", "to_world": to_world @ mi.ScalarTransform4f().scale(source.size), "emitter": area}
+
+

@@ -1,0 +1,98 @@
+"""Procedural textures: small RGB rasters of reflectance, drawn from a seed. Linear, in [0.02, 0.9]."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+Raster = NDArray[np.float32]
+
+SIZE = 128
+
+
+def color(rng: Generator) -> Raster:
+    """One reflectance: hue free, saturation mostly low as in real paint, value over the range of real surfaces."""
+    hue, saturation, value = rng.uniform(), rng.beta(1.2, 2.0), rng.uniform(0.05, 0.85)
+    ramp = np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
+    return np.float32(np.clip(value * (1 - saturation * (1 - ramp)), 0.02, 0.9))
+
+
+def noise(rng: Generator, size: int = SIZE, octaves: int = 5, start: int = 3) -> Raster:
+    """(size, size) fractal value noise that tiles, in [0, 1]."""
+    total = np.zeros((size, size))
+    for octave in range(octaves):
+        cells = start * 2**octave
+        if cells > size:
+            break
+        lattice = rng.uniform(size=(cells, cells))
+        total += _smooth_upsample(lattice, size) * 0.5**octave
+    low, high = total.min(), total.max()
+    return np.float32((total - low) / max(high - low, 1e-6))
+
+
+def _smooth_upsample(lattice: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Periodic interpolation with the smoothstep weight 3t^2 - 2t^3."""
+    cells = lattice.shape[0]
+    at = np.arange(size) * cells / size
+    low = at.astype(int)
+    t = at - low
+    t = t * t * (3 - 2 * t)
+    rows = lattice[low] * (1 - t)[:, None] + lattice[(low + 1) % cells] * t[:, None]
+    return rows[:, low] * (1 - t) + rows[:, (low + 1) % cells] * t
+
+
+def texture(rng: Generator) -> Raster:
+    """(SIZE, SIZE, 3) reflectance of one material: plain, mottled, checked, striped, dotted, bricked or veined."""
+    patterns = (_plain, _mottled, _checks, _stripes, _dots, _bricks, _veins)
+    pattern = patterns[rng.choice(len(patterns), p=[0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1])](rng)
+    two = np.stack([color(rng), color(rng)])
+    mixed = two[0] * (1 - pattern[..., None]) + two[1] * pattern[..., None]
+    grain = 1 + rng.uniform(0, 0.15) * (noise(rng, octaves=6, start=8)[..., None] - 0.5)
+    return np.float32(np.clip(mixed * grain, 0.02, 0.9))
+
+
+def _axes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    v, u = np.mgrid[:SIZE, :SIZE] / SIZE
+    return u, v
+
+
+def _plain(rng: Generator) -> Raster:
+    return np.zeros((SIZE, SIZE), np.float32)
+
+
+def _mottled(rng: Generator) -> Raster:
+    field = noise(rng, start=int(rng.integers(2, 9)))
+    return np.float32(np.clip((field - 0.5) * rng.uniform(1, 4) + 0.5, 0, 1))
+
+
+def _checks(rng: Generator) -> Raster:
+    u, v = _axes()
+    count = rng.integers(2, 10)
+    return np.float32((np.floor(u * count * 2) + np.floor(v * count * 2)) % 2)
+
+
+def _stripes(rng: Generator) -> Raster:
+    u, v = _axes()
+    phase = (u if rng.uniform() < 0.5 else v) * rng.integers(2, 14) + rng.uniform(0, 0.3) * noise(rng)
+    return np.float32(phase % 1 < rng.uniform(0.2, 0.8))
+
+
+def _dots(rng: Generator) -> Raster:
+    u, v = _axes()
+    count = rng.integers(3, 12)
+    return np.float32(np.hypot(u * count % 1 - 0.5, v * count % 1 - 0.5) < rng.uniform(0.2, 0.45))
+
+
+def _bricks(rng: Generator) -> Raster:
+    u, v = _axes()
+    rows = 2 * rng.integers(2, 7)
+    row = np.floor(v * rows)
+    along = (u * rows / 2 + 0.5 * (row % 2)) % 1
+    return np.float32((along < 0.06) | (v * rows % 1 < 0.12))
+
+
+def _veins(rng: Generator) -> Raster:
+    u, _ = _axes()
+    wave = np.sin(2 * np.pi * (rng.integers(1, 5) * u + rng.uniform(0.5, 2.5) * noise(rng)))
+    return np.float32(np.abs(wave) ** rng.uniform(0.3, 2))

@@ -1,0 +1,222 @@
+"""Triplets (photo, strokes, relit photo) mixed on the fly from renders of single sources, in linear light.
+
+A photo is the sum of its sources' renders, each with a strength and a tint, under one exposure that source and target
+share; its Lumi map is the same sum of their Lumi maps. Three kinds of pair: one light is added, removed or changed
+and the strokes speak of where it matters; all lights are replaced; nothing changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+from torch.utils.data import IterableDataset
+
+from dior_rt.family.mini import MODES
+from dior_rt.kernels import NumpyOps
+from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb, srgb_to_linear
+from dior_rt.training.render import View
+
+Lights = NDArray[np.float32]  # (sources, 3): strength times tint
+Raster = NDArray[np.float32]
+
+GRIDS = ((64, 64), (64, 64), (52, 80), (80, 52), (56, 72), (72, 56))
+KINDS = ("change", "replace", "keep")
+KIND_SHARES = (0.5, 0.38, 0.12)
+DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Photo and relit photo, linear and clipped at display white, with both Lumi maps; all (H, W, 3) float32."""
+
+    kind: str
+    photo: Raster
+    relit: Raster
+    source: Raster
+    target: Raster
+
+
+def mix(view: View, lights: Lights) -> tuple[Raster, Raster]:
+    """The image and the Lumi map of a view under some lights."""
+    image = np.einsum("khwc,kc->hwc", view.images.astype(np.float32), lights)
+    return image, np.einsum("khwc,kc->hwc", view.lumi.astype(np.float32), lights)
+
+
+def tint(rng: Generator) -> Raster:
+    """A light's colour, of luminance about 1: white, warm or cool half of the time, else any hue."""
+    if rng.uniform() < 0.5:
+        warmth = rng.normal(0, 0.25)
+        return np.float32(np.exp([warmth, 0.0, -1.4 * warmth]))
+    hue, saturation = rng.uniform(), rng.uniform(0.2, 1.0)
+    ramp = np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
+    shade = 1 - saturation * (1 - ramp)
+    return np.float32(shade / max(shade.mean(), 0.4))
+
+
+def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
+    """One or more of the usable sources, at strengths over some three stops, tinted."""
+    on = usable & (rng.uniform(size=usable.size) < 0.55)
+    if not on.any():
+        on = np.zeros_like(usable)
+        on[rng.choice(np.flatnonzero(usable))] = True
+    strengths = 2 ** rng.uniform(-2, 1, usable.size) * on
+    return np.float32(strengths)[:, None] * np.stack([tint(rng) for _ in usable])
+
+
+def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lights:
+    """One light added, removed, dimmed, strengthened or tinted anew; never the last one removed."""
+    changed = lights.copy()
+    k = rng.choice(np.flatnonzero(usable))
+    if not lights[k].any():
+        changed[k] = 2 ** rng.uniform(-1.5, 2) * tint(rng)
+        return changed
+    alone = np.count_nonzero(lights.any(axis=1)) == 1
+    how = rng.choice(["strength", "tint"] if alone else ["remove", "strength", "tint"])
+    if how == "remove":
+        changed[k] = 0
+    elif how == "strength":
+        changed[k] *= 2 ** rng.uniform(-3, 3)
+    else:
+        changed[k] = np.linalg.norm(lights[k]) / np.sqrt(3) * tint(rng)
+    return changed
+
+
+def exposed(image: Raster, white: float) -> float:
+    """The exposure that brings an image's 95th percentile to `white`."""
+    return white / max(float(np.percentile(image.max(axis=2), 95)), 1e-4)
+
+
+def pair(rng: Generator, view: View) -> Pair:
+    """A random pair of one view."""
+    usable = view.lumi.astype(np.float32).mean(axis=(1, 2, 3)) > DIMMEST
+    kind = str(rng.choice(KINDS, p=KIND_SHARES))
+    lights = random_lights(rng, usable)
+    if kind == "change":
+        relights = change_one(rng, lights, usable)
+    else:
+        relights = lights if kind == "keep" else random_lights(rng, usable)
+    photo, source = mix(view, lights)
+    relit, target = mix(view, relights)
+    exposure = exposed(photo, rng.uniform(0.3, 1.1))
+    # Lights so strong that the picture is lost in white teach nothing; a source's strength is free, so weaken all.
+    again = min(exposure, exposed(relit, rng.uniform(0.9, 1.5))) if kind == "change" else 0.0
+    if kind == "change" and again < exposure:
+        exposure = again
+    elif kind == "replace":
+        strength = exposed(relit, rng.uniform(0.3, 1.1)) / exposure
+        relit, target = relit * strength, target * strength
+    return Pair(kind, *(np.float32(raster) for raster in (
+        np.clip(photo * exposure, 0, 1), np.clip(relit * exposure, 0, 1), source * exposure, target * exposure
+    )))
+
+
+def window(rng: Generator, size: int, grid: tuple[int, int]) -> tuple[slice, slice, bool]:
+    """A random part of a square picture in the grid's shape, and whether to mirror it."""
+    scale = rng.uniform(0.7, 1.0) * size / max(grid)
+    height, width = round(grid[0] * scale), round(grid[1] * scale)
+    top, left = rng.integers(0, size - height + 1), rng.integers(0, size - width + 1)
+    return slice(top, top + height), slice(left, left + width), bool(rng.uniform() < 0.5)
+
+
+def resized(raster: Raster, grid: tuple[int, int]) -> Raster:
+    """Antialiased resampling in linear light."""
+    planes = torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1)[None]
+    small = F.interpolate(planes, size=grid, mode="bilinear", antialias=True)
+    return np.ascontiguousarray(small[0].permute(1, 2, 0).clamp_min(0).numpy())
+
+
+def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
+    """Light (h, w, 3) and mask (h, w) that a person might have drawn for the pair, at grid size."""
+    seed = int(rng.integers(2**31))
+    if sample.kind == "change" and rng.uniform() < 0.85:
+        change = np.abs(np.log((sample.target + 0.02) / (sample.source + 0.02))).max(axis=2)
+        drawn = ops.sparsify(sample.target, "strokes", seed, interest=np.float32(change**2 + 1e-6))
+        if rng.uniform() < 0.5:
+            # A person's brush lays one colour; a map's own values vary along a stroke.
+            inside = drawn.mask > 0
+            flat = np.where(inside[..., None], drawn.light[inside].mean(axis=0), 0)
+            return np.float32(flat), drawn.mask
+    else:
+        mode = ("strokes", "coarse", "dense")[rng.choice(3, p=[0.5, 0.25, 0.25])]
+        drawn = ops.sparsify(sample.target, mode, seed)
+    return drawn.light, drawn.mask
+
+
+@dataclass(frozen=True)
+class Mix:
+    """What share of the samples estimates, and what share relights without strokes (the null branch of guidance)."""
+
+    estimate: float = 0.15
+    null: float = 0.08
+
+
+class Batches(IterableDataset[dict[str, Tensor]]):
+    """An endless stream of batches; the n-th is the same on every run. Fields are the network's inputs and `x0`.
+
+    rank of ranks: this process's share where several train together.
+    """
+
+    def __init__(
+        self, views: list[View], batch: int, seed: int, start: int = 0, shares: Mix = Mix(), rank: int = 0
+    ) -> None:
+        super().__init__()
+        self.views, self.batch, self.seed, self.start, self.shares, self.rank = views, batch, seed, start, shares, rank
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        number = self.start
+        while True:
+            yield self.make(np.random.default_rng([self.seed, self.rank, number]))
+            number += 1
+
+    def make(self, rng: Generator) -> dict[str, Tensor]:
+        grid = GRIDS[rng.integers(len(GRIDS))]
+        samples = [self._sample(rng, grid) for _ in range(self.batch)]
+        return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
+
+    def _sample(self, rng: Generator, grid: tuple[int, int]) -> dict[str, Tensor]:
+        whole = pair(rng, self.views[rng.integers(len(self.views))])
+        rows, columns, mirror = window(rng, whole.photo.shape[0], grid)
+        step = -1 if mirror else 1
+        parts = (resized(r[rows, columns][:, ::step], grid) for r in (whole.photo, whole.relit, whole.source, whole.target))
+        small = Pair(whole.kind, *parts)
+        if rng.uniform() < self.shares.estimate:
+            return example(small, None, "estimate")
+        return example(small, None if rng.uniform() < self.shares.null else draw(rng, NumpyOps(), small), "relight")
+
+
+def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: str) -> dict[str, Tensor]:
+    """The network's inputs for a pair, and x0: what it should find."""
+
+    def planes(raster: Raster) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1).contiguous()
+
+    light, mask = strokes or (np.zeros_like(sample.photo), np.zeros(sample.photo.shape[:2], np.float32))
+    # A photo reaches the runtime in 8 bits.
+    photo = (linear_to_srgb(planes(sample.photo)) * 255).round() / 255
+    if mode == "relight":
+        x0 = RELIT_SCALE * (linear_to_srgb(planes(sample.relit)) - photo)
+    else:
+        x0 = 2 * encode_light(planes(sample.source)) - 1
+    return {
+        "photo": photo,
+        "light": planes(light),
+        "mask": planes(mask[..., None]),
+        "mode": torch.tensor(MODES[mode]),  # type: ignore[index]
+        "x0": x0,
+    }
+
+
+def load_views(folder: Path) -> list[View]:
+    """All views of a folder of renders, in memory (half a megabyte each). Raises ValueError where there is none."""
+    paths = sorted(folder.glob("*-*.npz"))
+    if not paths:
+        raise ValueError(f"there are no renders in {folder}; make some with `dior-rt train render --out {folder}`")
+    return [View.load(path) for path in paths]
