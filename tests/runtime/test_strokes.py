@@ -166,6 +166,24 @@ def test_arrays_that_are_no_maps_are_refused(tmp_path: Path, capfd: pytest.Captu
     assert said.err == "" and said.out == ""  # the library's own words stay inside
 
 
+def test_damaged_exr_bytes_never_escape_as_another_error(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    path = tmp_path / "m.exr"
+    write_exr(path, lumi())
+    whole = np.frombuffer(path.read_bytes(), np.uint8)
+    refused = 0
+    for i in range(300):
+        harmed = whole.copy()
+        harmed[rng.integers(0, 330 if i % 2 else len(whole), 4)] = rng.integers(0, 256, 4)
+        path.write_bytes(harmed.tobytes())
+        try:
+            read_exr(path, "map")
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 50
+
+
 def test_an_exr_without_colour_is_refused(tmp_path: Path) -> None:
     import OpenEXR
 
