@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dior_rt.kernels import NumpyOps, Stroke, Strokes
-from dior_rt.kernels.color import srgb_to_linear
 from PIL import Image
 
 from dior_rt.errors import InputError
 from dior_rt.exr import read_exr, write_exr
+from dior_rt.kernels import NumpyOps, Stroke, Strokes
+from dior_rt.kernels.color import srgb_to_linear
 from dior_rt.strokes import read_lumi, read_strokes, write_lumi, write_strokes
 
 SIZE = (40, 60)  # the photo's rows and columns
