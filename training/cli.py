@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -35,3 +37,78 @@ def render(
     share = _shard(shard)
     with typer.progressbar(length=len(range(share[0], scenes, share[1])), label="scenes") as bar:
         render_scenes(out, scenes, seed, share, lambda done, total: bar.update(1))
+
+
+@app.command()
+def fit(
+    renders: Annotated[Path, typer.Argument(help="Folder of renders.")],
+    out: Annotated[Path, typer.Option(help="Folder of the checkpoint; a run that stopped goes on from it.")],
+    steps: Annotated[int, typer.Option(min=1)] = 4000,
+    batch: Annotated[int, typer.Option(min=1)] = 32,
+    rate: Annotated[float, typer.Option(min=0, help="Peak learning rate.")] = 8e-4,
+    width: Annotated[int, typer.Option(min=8, help="Of a token; a multiple of 4 times the heads.")] = 192,
+    depth: Annotated[int, typer.Option(min=1)] = 6,
+    heads: Annotated[int, typer.Option(min=1)] = 6,
+    precision: Annotated[str, typer.Option(help="no, or bf16 where the processor or GPU has it.")] = "no",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Train the network on renders (stage 1). `accelerate launch -m dior_rt train fit ...` uses several GPUs."""
+    from dior_rt.training.fit import Plan
+    from dior_rt.training.fit import fit as run
+    from dior_rt.training.network import Config
+
+    plan = Plan(steps, batch, rate, seed=seed, precision=precision)
+    with _Bar(steps) as bar:
+        run(renders, out, Config(width, depth, heads), plan, bar.show)
+
+
+@app.command()
+def lora(
+    base: Annotated[Path, typer.Argument(help="model.safetensors of a trained network.")],
+    renders: Annotated[Path, typer.Argument(help="Folder of renders.")],
+    out: Annotated[Path, typer.Option(help="Folder of the checkpoint: the base's weights and the LoRA.")],
+    rank: Annotated[int, typer.Option(min=1)] = 32,
+    steps: Annotated[int, typer.Option(min=1)] = 500,
+    batch: Annotated[int, typer.Option(min=1)] = 32,
+    rate: Annotated[float, typer.Option(min=0)] = 4e-4,
+    precision: Annotated[str, typer.Option(help="no, or bf16 where the processor or GPU has it.")] = "no",
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+) -> None:
+    """Train a LoRA on top of a network; `dior-rt export` merges it."""
+    from dior_rt.training.fit import Plan, fit_lora
+
+    with _Bar(steps) as bar:
+        fit_lora(
+            base,
+            renders,
+            out,
+            rank,
+            Plan(steps, batch, rate, warmup=50, seed=seed, precision=precision),
+            bar.show,
+        )
+
+
+class _Bar:
+    """A progress bar on a terminal; elsewhere a line every hundred steps."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps, self.began = steps, time.monotonic()
+
+    def __enter__(self) -> _Bar:
+        self.bar = (
+            typer.progressbar(length=self.steps, label="steps").__enter__() if sys.stderr.isatty() else None
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar:
+            self.bar.render_finish()
+
+    def show(self, step: int, loss: float) -> None:
+        if self.bar:
+            self.bar.label = f"loss {loss:.4f}"
+            self.bar.update(step - self.bar.pos)
+        elif step % 100 == 0 or step == self.steps:
+            typer.echo(
+                f"step {step}/{self.steps}  loss {loss:.4f}  {time.monotonic() - self.began:.0f} s", err=True
+            )

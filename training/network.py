@@ -40,12 +40,16 @@ class Config:
 
 def srgb_to_linear(encoded: Tensor) -> Tensor:
     """IEC 61966-2-1, for values in 0..1."""
-    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded.clamp_min(0.04) + 0.055) / 1.055) ** 2.4)
+    return torch.where(
+        encoded <= 0.04045, encoded / 12.92, ((encoded.clamp_min(0.04) + 0.055) / 1.055) ** 2.4
+    )
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
     """IEC 61966-2-1, for values in 0..1; its straight foot goes on below 0."""
-    return torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055)
+    return torch.where(
+        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055
+    )
 
 
 def encode_light(light: Tensor) -> Tensor:
@@ -76,11 +80,15 @@ class Mini(nn.Module):
             nn.init.zeros_(silent.weight)
             nn.init.zeros_(silent.bias)
 
-    def forward(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
+    ) -> Tensor:
         x0 = self.predict(x, sigma, photo, light, mask, mode)
         return (x - x0) / sigma.clamp_min(SMALLEST_SIGMA)[:, None, None, None]
 
-    def predict(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor) -> Tensor:
+    def predict(
+        self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
+    ) -> Tensor:
         """x0, (B, 3, h, w)."""
         seen = torch.cat([x, 2 * photo - 1, encode_light(light) * mask, mask], dim=1)  # (B, 10, h, w)
         cells = self._cells(seen, sigma, mode)
@@ -120,7 +128,9 @@ class Block(nn.Module):
         return tokens + gate2 * self.down(hidden)
 
     def _attend(self, tokens: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
-        q, k, v = self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)  # (B, H, N, d)
+        q, k, v = (
+            self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+        )  # (B, H, N, d)
         # Queries and keys of unit length keep the logits bounded, whatever the precision.
         q, k = (rotate(_unit(part), turns).to(v.dtype) for part in (q, k))
         mixed = F.scaled_dot_product_attention(q, k, v, scale=8.0)
@@ -147,8 +157,12 @@ def rotations(rows: int, columns: int, size: int, device: torch.device) -> tuple
     """Cosine and sine (rows * columns, size / 2) of the rotary position code: half of it turns with the row, half
     with the column (RoPE, arXiv 2104.09864, along two axes). Nothing is learnt, so any shape of grid works."""
     frequency = torch.exp(-math.log(100.0) * torch.arange(size // 4, device=device) / (size // 4))
-    down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(rows, columns, size // 4)
-    along = (torch.arange(columns, device=device)[:, None] * frequency)[None, :, :].expand(rows, columns, size // 4)
+    down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(
+        rows, columns, size // 4
+    )
+    along = (torch.arange(columns, device=device)[:, None] * frequency)[None, :, :].expand(
+        rows, columns, size // 4
+    )
     angle = torch.cat([down, along], dim=2).reshape(rows * columns, size // 2)
     return torch.cos(angle), torch.sin(angle)
 

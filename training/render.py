@@ -72,7 +72,11 @@ class View:
 
 
 def render_scenes(
-    out: Path, scenes: int, seed: int, shard: tuple[int, int] = (0, 1), progress: Callable[[int, int], None] | None = None
+    out: Path,
+    scenes: int,
+    seed: int,
+    shard: tuple[int, int] = (0, 1),
+    progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render the scenes of this shard (index, count) that are not there yet, two views each, to `out/<scene>-<view>.npz`.
 
@@ -105,7 +109,12 @@ class Stage:
 
 
 def view(
-    stage: Stage, described: Scene, camera: Camera, seed: int, resolution: int = RESOLUTION, samples: int = SAMPLES
+    stage: Stage,
+    described: Scene,
+    camera: Camera,
+    seed: int,
+    resolution: int = RESOLUTION,
+    samples: int = SAMPLES,
 ) -> View:
     """Render one camera's view of every source, original and white."""
     images, lumi = [], []
@@ -165,7 +174,9 @@ def _render(
 
 def _load(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> dict[str, Any]:
     mi = mitsuba()
-    return {f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)}
+    return {
+        f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)
+    }
 
 
 def _mesh(mesh: Mesh, bsdf: Any) -> Any:
@@ -237,6 +248,8 @@ def _emitter(source: Source) -> dict[str, Any]:
     )
     if source.kind == "spot":
         return {"type": "spot", "to_world": to_world, "intensity": radiance, "cutoff_angle": source.size}
-    return {"type": "rectangle", "to_world": to_world @ mi.ScalarTransform4f().scale(source.size), "emitter": area}
-
-
+    return {
+        "type": "rectangle",
+        "to_world": to_world @ mi.ScalarTransform4f().scale(source.size),
+        "emitter": area,
+    }

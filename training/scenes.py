@@ -111,7 +111,9 @@ def _surroundings(rng: Generator) -> list[Thing]:
     ]
 
 
-def _stand(mesh: Mesh, scale: Vector, turn: float, x: float, z: float, floor: float, material: Material) -> Thing:
+def _stand(
+    mesh: Mesh, scale: Vector, turn: float, x: float, z: float, floor: float, material: Material
+) -> Thing:
     """The mesh with its lowest point on the floor."""
     placed = mesh.placed(scale, turn, np.array([x, 0.0, z]))
     lowest = float(placed.vertices[:, 1].min())
@@ -121,7 +123,13 @@ def _stand(mesh: Mesh, scale: Vector, turn: float, x: float, z: float, floor: fl
 def _subject(rng: Generator) -> list[Thing]:
     """One figure: a body, most often with a head on it."""
     body = _stand(
-        shapes.random_shape(rng), rng.uniform(0.5, 1.0, 3), rng.uniform(0, 6.28), 0, 0, rng.uniform(-0.1, 0), _material(rng)
+        shapes.random_shape(rng),
+        rng.uniform(0.5, 1.0, 3),
+        rng.uniform(0, 6.28),
+        0,
+        0,
+        rng.uniform(-0.1, 0),
+        _material(rng),
     )
     things = [*_surroundings(rng), body]
     if rng.uniform() < 0.65:
@@ -140,7 +148,9 @@ def _objects(rng: Generator) -> list[Thing]:
         scale = rng.uniform(0.2, 0.75) * rng.uniform(0.6, 1.5, 3)
         x, z = rng.normal(0, 0.9, 2)
         floor = rng.uniform(0, 1.0) if rng.uniform() < 0.15 else 0.0
-        things.append(_stand(shapes.random_shape(rng), scale, rng.uniform(0, 6.28), x, z, floor, _material(rng)))
+        things.append(
+            _stand(shapes.random_shape(rng), scale, rng.uniform(0, 6.28), x, z, floor, _material(rng))
+        )
     return things
 
 
@@ -151,7 +161,9 @@ def _interior(rng: Generator) -> list[Thing]:
     things = [
         _slab((half + 3, 0.1, back + 5), (0, -0.1, 0), _material(rng)),
         _slab((half + 0.2, middle, 0.1), (0, middle, -back - 0.1), wall),
-        _slab((0.1, middle, back + 1.5), (-half - 0.1, middle, 0), wall if rng.uniform() < 0.5 else _matte(rng)),
+        _slab(
+            (0.1, middle, back + 1.5), (-half - 0.1, middle, 0), wall if rng.uniform() < 0.5 else _matte(rng)
+        ),
         _slab((0.1, middle, back + 1.5), (half + 0.1, middle, 0), wall),
     ]
     if rng.uniform() < 0.6:
@@ -170,14 +182,18 @@ def _furniture(rng: Generator, half: float, back: float) -> list[Thing]:
     if rng.uniform() < 0.6:
         scale = rng.uniform(0.12, 0.35) * rng.uniform(0.7, 1.4, 3)
         top = float(block.mesh.vertices[:, 1].max())
-        things.append(_stand(shapes.random_shape(rng), scale, rng.uniform(0, 6.28), x, z, top, _material(rng)))
+        things.append(
+            _stand(shapes.random_shape(rng), scale, rng.uniform(0, 6.28), x, z, top, _material(rng))
+        )
     return things
 
 
 def _camera(rng: Generator, kind: str) -> Camera:
     if kind == "interior":
         at = np.array([rng.uniform(-0.8, 0.8), rng.uniform(0.9, 1.9), rng.uniform(3.0, 4.5)])
-        return Camera(at, np.array([rng.uniform(-0.6, 0.6), rng.uniform(0.5, 1.2), -1.0]), rng.uniform(40, 62))
+        return Camera(
+            at, np.array([rng.uniform(-0.6, 0.6), rng.uniform(0.5, 1.2), -1.0]), rng.uniform(40, 62)
+        )
     around, up, away = rng.uniform(-0.7, 0.7), rng.uniform(0.1, 0.8), rng.uniform(3.2, 5.0)
     direction = np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
     target = np.array([rng.normal(0, 0.2), rng.uniform(0.3, 0.9), rng.normal(0, 0.2)])
@@ -189,7 +205,9 @@ def _sources(rng: Generator, kind: str, cameras: tuple[Camera, ...]) -> list[Sou
     sources: list[Source] = []
     while len(sources) < SOURCES:
         source = _source(rng, kind)
-        radius = 0.0 if source.kind == "spot" else source.size * (np.sqrt(2) if source.kind == "panel" else 1.0)
+        radius = (
+            0.0 if source.kind == "spot" else source.size * (np.sqrt(2) if source.kind == "panel" else 1.0)
+        )
         if not any(camera.sees(source.at, radius) for camera in cameras):
             sources.append(source)
     return [*sources, Source("dome", np.zeros(3), np.zeros(3), 0.0)]
@@ -197,7 +215,9 @@ def _sources(rng: Generator, kind: str, cameras: tuple[Camera, ...]) -> list[Sou
 
 def _source(rng: Generator, kind: str) -> Source:
     form = ("sphere", "panel", "spot")[rng.choice(3, p=[0.45, 0.2, 0.35])]
-    size = {"sphere": rng.uniform(0.03, 0.4), "panel": rng.uniform(0.15, 0.8), "spot": rng.uniform(9, 32)}[form]
+    size = {"sphere": rng.uniform(0.03, 0.4), "panel": rng.uniform(0.15, 0.8), "spot": rng.uniform(9, 32)}[
+        form
+    ]
     target = np.array([rng.normal(0, 0.8), rng.uniform(0, 1.2), rng.normal(-0.2, 0.8)])
     if kind == "interior":
         at = np.array([rng.uniform(-1.5, 1.5), rng.uniform(0.3, 2.1), rng.uniform(-1, 4.5)])

@@ -65,7 +65,9 @@ def box(half: NDArray[np.float64]) -> Mesh:
             vertices.append(corners)
             uv.append(corners[:, [u, v]] / 2)
     return Mesh(
-        np.float32(np.concatenate(vertices)), np.float32(np.concatenate(uv)), np.concatenate(faces).astype(np.uint32)
+        np.float32(np.concatenate(vertices)),
+        np.float32(np.concatenate(uv)),
+        np.concatenate(faces).astype(np.uint32),
     )
 
 
@@ -93,7 +95,9 @@ def lathe(rng: Generator) -> Mesh:
     """A turned profile: vase, bottle, bowl, pawn."""
     around, along = _angles()
     height = (along[:, 0] + np.pi / 2) / np.pi
-    knots = np.concatenate([[rng.uniform(0.4, 1)], rng.uniform(0.2, 1, rng.integers(2, 5)), [rng.uniform(0.2, 0.8)]])
+    knots = np.concatenate(
+        [[rng.uniform(0.4, 1)], rng.uniform(0.2, 1, rng.integers(2, 5)), [rng.uniform(0.2, 0.8)]]
+    )
     profile = np.interp(height, np.linspace(0, 1, len(knots)), knots)
     profile = np.convolve(np.pad(profile, 4, mode="edge"), np.ones(9) / 9, mode="valid")
     profile[0] = profile[-1] = 0
@@ -124,7 +128,7 @@ def bumpy(mesh: Mesh, rng: Generator, depth: float) -> Mesh:
 def terrain(rng: Generator, half: float, depth: float) -> Mesh:
     """Uneven ground of the given half width around the origin, y up, its height within the depth."""
     field = np.pad(noise(rng, size=64, octaves=4), ((0, 1), (0, 1)), mode="wrap")
-    z, x = np.mgrid[-half : half : 65j, -half : half : 65j]
+    z, x = np.mgrid[-half:half:65j, -half:half:65j]
     return _lattice(np.stack([x, depth * (field - 0.5), z], axis=-1))
 
 

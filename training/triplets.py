@@ -21,7 +21,7 @@ from torch.utils.data import IterableDataset
 
 from dior_rt.family.mini import MODES
 from dior_rt.kernels import NumpyOps
-from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb, srgb_to_linear
+from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb
 from dior_rt.training.render import View
 
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
@@ -113,9 +113,18 @@ def pair(rng: Generator, view: View) -> Pair:
     elif kind == "replace":
         strength = exposed(relit, rng.uniform(0.3, 1.1)) / exposure
         relit, target = relit * strength, target * strength
-    return Pair(kind, *(np.float32(raster) for raster in (
-        np.clip(photo * exposure, 0, 1), np.clip(relit * exposure, 0, 1), source * exposure, target * exposure
-    )))
+    return Pair(
+        kind,
+        *(
+            np.float32(raster)
+            for raster in (
+                np.clip(photo * exposure, 0, 1),
+                np.clip(relit * exposure, 0, 1),
+                source * exposure,
+                target * exposure,
+            )
+        ),
+    )
 
 
 def window(rng: Generator, size: int, grid: tuple[int, int]) -> tuple[slice, slice, bool]:
@@ -168,7 +177,14 @@ class Batches(IterableDataset[dict[str, Tensor]]):
         self, views: list[View], batch: int, seed: int, start: int = 0, shares: Mix = Mix(), rank: int = 0
     ) -> None:
         super().__init__()
-        self.views, self.batch, self.seed, self.start, self.shares, self.rank = views, batch, seed, start, shares, rank
+        self.views, self.batch, self.seed, self.start, self.shares, self.rank = (
+            views,
+            batch,
+            seed,
+            start,
+            shares,
+            rank,
+        )
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         number = self.start
@@ -185,11 +201,16 @@ class Batches(IterableDataset[dict[str, Tensor]]):
         whole = pair(rng, self.views[rng.integers(len(self.views))])
         rows, columns, mirror = window(rng, whole.photo.shape[0], grid)
         step = -1 if mirror else 1
-        parts = (resized(r[rows, columns][:, ::step], grid) for r in (whole.photo, whole.relit, whole.source, whole.target))
+        parts = (
+            resized(r[rows, columns][:, ::step], grid)
+            for r in (whole.photo, whole.relit, whole.source, whole.target)
+        )
         small = Pair(whole.kind, *parts)
         if rng.uniform() < self.shares.estimate:
             return example(small, None, "estimate")
-        return example(small, None if rng.uniform() < self.shares.null else draw(rng, NumpyOps(), small), "relight")
+        return example(
+            small, None if rng.uniform() < self.shares.null else draw(rng, NumpyOps(), small), "relight"
+        )
 
 
 def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: str) -> dict[str, Tensor]:
@@ -218,5 +239,7 @@ def load_views(folder: Path) -> list[View]:
     """All views of a folder of renders, in memory (half a megabyte each). Raises ValueError where there is none."""
     paths = sorted(folder.glob("*-*.npz"))
     if not paths:
-        raise ValueError(f"there are no renders in {folder}; make some with `dior-rt train render --out {folder}`")
+        raise ValueError(
+            f"there are no renders in {folder}; make some with `dior-rt train render --out {folder}`"
+        )
     return [View.load(path) for path in paths]
