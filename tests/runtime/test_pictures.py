@@ -15,10 +15,10 @@ import numpy as np
 import png
 import pytest
 import tifffile
-from dior_rt.kernels.color import srgb_to_linear
 from PIL import ExifTags, Image, ImageCms, ImageOps, PngImagePlugin
 
 from dior_rt.errors import InputError
+from dior_rt.kernels.color import srgb_to_linear
 from dior_rt.metadata import read_settings
 from dior_rt.pictures import MOST_PIXELS, Photo, check_output, read_photo, write_photo
 from dior_rt.profiles import convert_to_srgb
