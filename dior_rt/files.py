@@ -33,6 +33,14 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
             draft.unlink()
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder, and those above it, unless it is there. Raises InputError where that cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise InputError(f"Cannot make the folder {path}: {reason(error)}.") from error
+
+
 def check_writable(path: Path) -> None:
     """Raise InputError now if `replacing(path)` would fail later, as far as can be known."""
     try:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 app = typer.Typer(no_args_is_help=True, help="Render scenes and train the network (needs dior-rt[train]).")
+
+
+Precision = Annotated[Literal["no", "bf16"], typer.Option(help="bf16 where the processor or GPU has it.")]
 
 
 @app.callback()
@@ -46,13 +49,13 @@ def fit(
     steps: Annotated[int, typer.Option(min=1)] = 4000,
     batch: Annotated[int, typer.Option(min=1)] = 32,
     rate: Annotated[float, typer.Option(min=0, help="Peak learning rate.")] = 8e-4,
-    width: Annotated[int, typer.Option(min=8, help="Of a token; a multiple of 4 times the heads.")] = 192,
+    width: Annotated[int, typer.Option(min=8, help="Of a token; a multiple of 4 times the heads.")] = 256,
     depth: Annotated[int, typer.Option(min=1)] = 6,
-    heads: Annotated[int, typer.Option(min=1)] = 6,
-    precision: Annotated[str, typer.Option(help="no, or bf16 where the processor or GPU has it.")] = "no",
+    heads: Annotated[int, typer.Option(min=1)] = 8,
+    precision: Precision = "no",
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:
-    """Train the network on renders (stage 1). `accelerate launch -m dior_rt train fit ...` uses several GPUs."""
+    """Train the network on renders. `accelerate launch -m dior_rt train fit ...` uses several GPUs."""
     from dior_rt.training.fit import Plan
     from dior_rt.training.fit import fit as run
     from dior_rt.training.network import Config
@@ -71,21 +74,15 @@ def lora(
     steps: Annotated[int, typer.Option(min=1)] = 500,
     batch: Annotated[int, typer.Option(min=1)] = 32,
     rate: Annotated[float, typer.Option(min=0)] = 4e-4,
-    precision: Annotated[str, typer.Option(help="no, or bf16 where the processor or GPU has it.")] = "no",
+    precision: Precision = "no",
     seed: Annotated[int, typer.Option(min=0)] = 1,
 ) -> None:
     """Train a LoRA on top of a network; `dior-rt export` merges it."""
     from dior_rt.training.fit import Plan, fit_lora
 
+    plan = Plan(steps, batch, rate, warmup=50, seed=seed, precision=precision)
     with _Bar(steps) as bar:
-        fit_lora(
-            base,
-            renders,
-            out,
-            rank,
-            Plan(steps, batch, rate, warmup=50, seed=seed, precision=precision),
-            bar.show,
-        )
+        fit_lora(base, renders, out, rank, plan, bar.show)
 
 
 class _Bar:

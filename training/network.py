@@ -4,8 +4,8 @@ Its heads are physical. To relight it predicts a log-ratio r of light a cell and
 
     relit = (photo + e) exp(r) - e        in linear light, e = 0.02
 
-so a network that has learnt nothing returns the photo, and black can still be lit. To estimate it predicts the
-encoded Lumi map as a change of the encoded photo. Both become x0, and the velocity is v = (x - x0) / sigma.
+so a network that has learnt nothing returns the photo, and black can still be lit. To estimate it predicts
+the encoded Lumi map as a change of the encoded photo. Both become x0; the velocity is v = (x - x0) / sigma.
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from dior_rt.errors import InputError
+from dior_rt.files import check_readable, reason, replacing
 
 FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
 RELIT_SCALE = 4.0
@@ -29,13 +32,20 @@ SMALLEST_SIGMA = 1e-3
 
 @dataclass(frozen=True)
 class Config:
-    """The network's size. width: of a token, a multiple of 4 * heads; patch: cells a side that share a token."""
+    """The network's size. width: of a token, a multiple of 4 heads; patch: a token's side, in cells.
 
-    width: int = 192
+    Raises InputError for a width that the heads do not divide so.
+    """
+
+    width: int = 256
     depth: int = 6
-    heads: int = 6
-    patch: int = 4
+    heads: int = 8
+    patch: int = 8
     features: int = 24  # a cell, between the transformer and the output's convolutions
+
+    def __post_init__(self) -> None:
+        if self.width % (4 * self.heads):
+            raise InputError(f"The width must be a multiple of 4 times the heads; {self.width} is none.")
 
 
 def srgb_to_linear(encoded: Tensor) -> Tensor:
@@ -77,8 +87,8 @@ class Mini(nn.Module):
         self.smooth = nn.Conv2d(config.features + 10, config.features, 3, padding=1)
         self.head = nn.Conv2d(config.features, 6, 3, padding=1)
         for silent in (self.modulation, self.head):
-            nn.init.zeros_(silent.weight)
-            nn.init.zeros_(silent.bias)
+            for weight in silent.parameters():
+                nn.init.zeros_(weight)
 
     def forward(
         self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
@@ -111,7 +121,7 @@ class Mini(nn.Module):
 
 
 class Block(nn.Module):
-    """Attention and MLP under adaptive norms; one modulation is shared by all blocks, each adds its own offset."""
+    """Attention and MLP under adaptive norms; all blocks share the modulation, each adds its own offset."""
 
     def __init__(self, config: Config) -> None:
         super().__init__()
@@ -131,9 +141,10 @@ class Block(nn.Module):
         q, k, v = (
             self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
         )  # (B, H, N, d)
-        # Queries and keys of unit length keep the logits bounded, whatever the precision.
-        q, k = (rotate(_unit(part), turns).to(v.dtype) for part in (q, k))
-        mixed = F.scaled_dot_product_attention(q, k, v, scale=8.0)
+        # Queries and keys of unit length keep the logits within 8 of 0, whatever the precision. Written out:
+        # with so few tokens the fused attention's backward pass takes a multiple of the time on CPUs.
+        logits = rotate(_unit(q), turns) @ rotate(8 * _unit(k), turns).transpose(2, 3)  # (B, H, N, N)
+        mixed = logits.softmax(dim=-1) @ v
         return self.proj(mixed.transpose(1, 2).flatten(2))
 
 
@@ -142,8 +153,7 @@ def _norm(tokens: Tensor) -> Tensor:
 
 
 def _unit(part: Tensor) -> Tensor:
-    part = part.float()
-    return part * torch.rsqrt(part.square().sum(-1, keepdim=True) + 1e-6)
+    return F.normalize(part, dim=-1)
 
 
 def waves(sigma: Tensor, width: int) -> Tensor:
@@ -154,8 +164,10 @@ def waves(sigma: Tensor, width: int) -> Tensor:
 
 
 def rotations(rows: int, columns: int, size: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Cosine and sine (rows * columns, size / 2) of the rotary position code: half of it turns with the row, half
-    with the column (RoPE, arXiv 2104.09864, along two axes). Nothing is learnt, so any shape of grid works."""
+    """Cosine and sine (rows * columns, size / 2) of the rotary position code (RoPE, arXiv 2104.09864).
+
+    Half of it turns with the row, half with the column. Nothing is learnt, so any shape of grid works.
+    """
     frequency = torch.exp(-math.log(100.0) * torch.arange(size // 4, device=device) / (size // 4))
     down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(
         rows, columns, size // 4
@@ -187,19 +199,22 @@ def _estimate(photo: Tensor, raw: Tensor) -> Tensor:
 
 
 def save_network(network: Mini, path: Path) -> None:
-    """Weights as safetensors, the configuration in its header; written whole or not at all."""
-    partial = path.with_suffix(".partial")
+    """Weights as safetensors, the configuration in its header; written whole, or InputError raised."""
     weights = {name: weight.contiguous() for name, weight in network.state_dict().items()}
-    save_file(weights, partial, metadata={"config": json.dumps(asdict(network.config))})
-    partial.replace(path)
+    with replacing(path) as file:
+        file.write(save(weights, {"config": json.dumps(asdict(network.config))}))
 
 
 def load_network(path: Path) -> Mini:
     """The network of a safetensors file written by `save_network`; half-precision weights become float32.
 
-    Raises OSError, SafetensorError, KeyError, TypeError or ValueError for a file that is something else.
+    Raises InputError for a file that is missing, cut short, or something else.
     """
-    with safe_open(path, "pt") as file:
-        network = Mini(Config(**json.loads((file.metadata() or {})["config"])))
-    network.load_state_dict({name: weight.float() for name, weight in load_file(path).items()})
+    check_readable(path, "checkpoint")
+    try:
+        with safe_open(path, "pt") as file:
+            network = Mini(Config(**json.loads((file.metadata() or {})["config"])))
+        network.load_state_dict({name: weight.float() for name, weight in load_file(path).items()})
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path} is no checkpoint of mini: {reason(error)}.") from error
     return network.eval()

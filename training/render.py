@@ -1,7 +1,7 @@
 """Renders: every source of a scene alone, as a picture with the scene's materials and as a Lumi map.
 
-A Lumi map is the light that a white matte surface of albedo 1 in each surface's place sends back, straight from the
-source and nothing bounced:
+A Lumi map is the light that a white matte surface of albedo 1 in each surface's place sends back, straight
+from the source and nothing bounced:
 
     L(p) = (1 / pi) * integral over the hemisphere at x_p of  L_src(x_p, w) * max(n . w, 0) dw
 
@@ -15,10 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dior_rt.errors import InputError
+from dior_rt.files import make_folder, reason, replacing
 from dior_rt.training.scenes import Camera, Material, Mesh, Scene, Source, Thing, scene
 
 RESOLUTION = 96
@@ -31,8 +34,8 @@ FORMAT = 1
 def mitsuba() -> Any:
     """The renderer, in the variant that needs nothing but its wheel.
 
-    Shards, one process a core, use all cores; the LLVM variant compiles anew for most scenes, which costs at these
-    sizes what it gains.
+    Shards, one process a core, use all cores; the LLVM variant compiles anew for most scenes, which costs at
+    these sizes what it gains.
     """
     import mitsuba as mi
 
@@ -44,8 +47,11 @@ def mitsuba() -> Any:
 
 @dataclass(frozen=True)
 class View:
-    """One scene from one camera. images, lumi: (sources, H, W, 3) linear float16, each source alone at unit scale;
-    the last source is the dome. kinds: each source's kind. A source's unit is such that its Lumi map's mean is 1/4."""
+    """One scene from one camera, by source, each alone.
+
+    images, lumi: (sources, H, W, 3), linear; every source so strong that the mean of its Lumi map is 1/4.
+    kinds: of the sources, the last of which is the dome.
+    """
 
     images: NDArray[np.float16]
     lumi: NDArray[np.float16]
@@ -54,21 +60,23 @@ class View:
     seed: int
 
     def save(self, path: Path) -> None:
-        """Written whole or not at all."""
+        """Written whole or not at all. Raises InputError."""
         head = {"format": FORMAT, "kinds": self.kinds, "scene_kind": self.scene_kind, "seed": self.seed}
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as file:
+        with replacing(path) as file:
             np.savez(file, images=self.images, lumi=self.lumi, head=np.array(json.dumps(head)))
-        partial.replace(path)
 
     @staticmethod
     def load(path: Path) -> View:
-        with np.load(path, allow_pickle=False) as stored:
-            head = json.loads(str(stored["head"]))
-            if head["format"] != FORMAT:
-                raise ValueError(f"{path} was rendered by another version; render it again")
-            kinds = tuple(head["kinds"])
-            return View(stored["images"], stored["lumi"], kinds, head["scene_kind"], head["seed"])
+        """What `save` wrote. Raises InputError for a file that is cut short, or something else."""
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                head = json.loads(str(stored["head"]))
+                if head["format"] != FORMAT:
+                    raise ValueError("another version made it")
+                kinds = tuple(head["kinds"])
+                return View(stored["images"], stored["lumi"], kinds, head["scene_kind"], head["seed"])
+        except (OSError, BadZipFile, EOFError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path} is no render that can be used: {reason(error)}.") from error
 
 
 def render_scenes(
@@ -78,11 +86,13 @@ def render_scenes(
     shard: tuple[int, int] = (0, 1),
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Render the scenes of this shard (index, count) that are not there yet, two views each, to `out/<scene>-<view>.npz`.
+    """Render the scenes that are not there yet, two views each, to `out/<scene>-<view>.npz`.
 
-    Scene numbers are seed * 1,000,000 + k for k in 0 .. scenes - 1, so that sets of different seeds never share one.
+    shard: (index, count), this process's share. Scene numbers are seed * 1,000,000 + k for k in
+    0 .. scenes - 1, so that sets of different seeds share none. Raises InputError where nothing can be
+    written.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     index, count = shard
     mine = [seed * 1_000_000 + k for k in range(index, scenes, count)]
     for done, number in enumerate(mine):
@@ -98,7 +108,7 @@ def render_scenes(
 
 @dataclass(frozen=True)
 class Stage:
-    """The things of a scene in the renderer, as they are and as white matte ones; loading costs as much as a render."""
+    """A scene's things as they are, and all white and matte; loaded once, as it costs as much as a render."""
 
     original: dict[str, Any]
     white: dict[str, Any]
@@ -122,7 +132,7 @@ def view(
         rays = 2 * samples if source.kind == "dome" else samples  # most of the dome's rays are blocked
         light = lumi_map(stage, camera, source, resolution, rays, seed=k)
         image = picture(stage, camera, source, resolution, rays, seed=k)
-        # A source's strength is arbitrary until triplets mix it; a common mean keeps half floats in their good range.
+        # A source's strength is arbitrary until triplets mix it; a common mean suits half floats.
         unit = 0.25 / max(float(light.mean()), 1e-6)
         images.append(_half(image * unit))
         lumi.append(_half(light * unit))

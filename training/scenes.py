@@ -1,4 +1,4 @@
-"""Random scenes as plain data, drawn from a seed: what stands where, of what, seen from where, lit by which sources."""
+"""Random scenes as plain data, drawn from a seed: things, cameras, and the sources that light them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SOURCES = 4  # local sources a scene; the dome comes on top
 
 @dataclass(frozen=True)
 class Material:
-    """finish: how the reflectance (T, T, 3) is coated; roughness: width of the highlight, 0 mirror .. 1 matte."""
+    """finish: how the reflectance (T, T, 3) is coated. roughness: of the coat, 0 mirror .. 1 matte."""
 
     finish: Literal["matte", "plastic", "metal"]
     reflectance: NDArray[np.float32]
@@ -35,8 +35,11 @@ class Thing:
 
 @dataclass(frozen=True)
 class Source:
-    """One light of radiance 1. sphere: radius = size; panel: a square of side 2 * size; spot: a point, half angle = size
-    (degrees); dome: light from everywhere, no place. `target` is what panel and spot face."""
+    """One light of radiance 1; a spot is a point of intensity 1. `target`: what panel and spot face.
+
+    size: a sphere's radius; half a square panel's side; a spot's half angle in degrees. A dome shines from
+    everywhere and has neither place nor size.
+    """
 
     kind: Literal["sphere", "panel", "spot", "dome"]
     at: Vector
@@ -71,7 +74,7 @@ class Scene:
 
 
 def scene(seed: int, cameras: int = 2) -> Scene:
-    """The scene of that seed: an isolated subject, interacting objects, or an interior. About 4 units across."""
+    """The scene of that seed, about 4 units across: a subject alone, interacting objects, or an interior."""
     rng = np.random.default_rng(seed)
     kind = KINDS[rng.choice(3, p=[0.25, 0.45, 0.3])]
     builders = {"subject": _subject, "objects": _objects, "interior": _interior}

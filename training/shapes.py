@@ -18,7 +18,10 @@ AROUND, ALONG = 64, 48
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices (N, 3), texture coordinates (N, 2), triangles (M, 3); about one unit in radius, at the origin, y up."""
+    """vertices (N, 3), texture coordinates (N, 2), triangles (M, 3).
+
+    Shapes are about one unit in radius, at the origin, y up.
+    """
 
     vertices: NDArray[np.float32]
     uv: NDArray[np.float32]
@@ -28,7 +31,8 @@ class Mesh:
         """Scaled per axis, turned by an angle (radians) about y, moved."""
         c, s = np.cos(turn), np.sin(turn)
         rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-        return Mesh(np.float32((self.vertices * scale) @ rotation.T + at), self.uv, self.faces)
+        moved = (self.vertices * scale) @ rotation.T + at
+        return Mesh(moved.astype(np.float32), self.uv, self.faces)
 
 
 def _lattice(position: NDArray[np.float64]) -> Mesh:
@@ -40,7 +44,8 @@ def _lattice(position: NDArray[np.float64]) -> Mesh:
     upper = np.stack([corner + 1, corner + columns, corner + columns + 1], axis=1)
     uv = np.stack([u / (columns - 1), v / (rows - 1)], axis=-1).reshape(-1, 2)
     faces = np.concatenate([lower, upper]).astype(np.uint32)
-    return _without_slivers(Mesh(np.float32(position.reshape(-1, 3)), np.float32(uv), faces))
+    vertices = position.reshape(-1, 3)
+    return _without_slivers(Mesh(vertices.astype(np.float32), uv.astype(np.float32), faces))
 
 
 def _without_slivers(mesh: Mesh) -> Mesh:
@@ -51,8 +56,10 @@ def _without_slivers(mesh: Mesh) -> Mesh:
 
 
 def box(half: NDArray[np.float64]) -> Mesh:
-    """A cuboid of the given half sides, centred; sharp edges, and a texture that keeps its scale (2 units a repeat)."""
-    vertices, uv, faces = [], [], []
+    """A cuboid of the given half sides, centred: sharp edges, and a texture that repeats every 2 units."""
+    vertices: list[NDArray[np.float64]] = []
+    uv: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.int64]] = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         for sign in (-1.0, 1.0):
@@ -65,8 +72,8 @@ def box(half: NDArray[np.float64]) -> Mesh:
             vertices.append(corners)
             uv.append(corners[:, [u, v]] / 2)
     return Mesh(
-        np.float32(np.concatenate(vertices)),
-        np.float32(np.concatenate(uv)),
+        np.concatenate(vertices).astype(np.float32),
+        np.concatenate(uv).astype(np.float32),
         np.concatenate(faces).astype(np.uint32),
     )
 
@@ -122,7 +129,7 @@ def bumpy(mesh: Mesh, rng: Generator, depth: float) -> Mesh:
     row = np.minimum((mesh.uv[:, 1] * (AROUND - 1)).round().astype(int), AROUND - 1)
     poles = np.sin(np.pi * mesh.uv[:, 1])
     push = 1 + depth * (field[row, column] - 0.5) * poles
-    return Mesh(np.float32(mesh.vertices * push[:, None]), mesh.uv, mesh.faces)
+    return Mesh((mesh.vertices * push[:, None]).astype(np.float32), mesh.uv, mesh.faces)
 
 
 def terrain(rng: Generator, half: float, depth: float) -> Mesh:

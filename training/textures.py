@@ -12,10 +12,10 @@ SIZE = 128
 
 
 def color(rng: Generator) -> Raster:
-    """One reflectance: hue free, saturation mostly low as in real paint, value over the range of real surfaces."""
+    """One reflectance (3,): any hue, a saturation mostly low as in paint, the values of real surfaces."""
     hue, saturation, value = rng.uniform(), rng.beta(1.2, 2.0), rng.uniform(0.05, 0.85)
     ramp = np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
-    return np.float32(np.clip(value * (1 - saturation * (1 - ramp)), 0.02, 0.9))
+    return np.clip(value * (1 - saturation * (1 - ramp)), 0.02, 0.9).astype(np.float32)
 
 
 def noise(rng: Generator, size: int = SIZE, octaves: int = 5, start: int = 3) -> Raster:
@@ -28,7 +28,7 @@ def noise(rng: Generator, size: int = SIZE, octaves: int = 5, start: int = 3) ->
         lattice = rng.uniform(size=(cells, cells))
         total += _smooth_upsample(lattice, size) * 0.5**octave
     low, high = total.min(), total.max()
-    return np.float32((total - low) / max(high - low, 1e-6))
+    return ((total - low) / max(high - low, 1e-6)).astype(np.float32)
 
 
 def _smooth_upsample(lattice: NDArray[np.float64], size: int) -> NDArray[np.float64]:
@@ -43,13 +43,13 @@ def _smooth_upsample(lattice: NDArray[np.float64], size: int) -> NDArray[np.floa
 
 
 def texture(rng: Generator) -> Raster:
-    """(SIZE, SIZE, 3) reflectance of one material: plain, mottled, checked, striped, dotted, bricked or veined."""
+    """(SIZE, SIZE, 3) reflectance of one material: two colours in a pattern, and a little grain."""
     patterns = (_plain, _mottled, _checks, _stripes, _dots, _bricks, _veins)
     pattern = patterns[rng.choice(len(patterns), p=[0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1])](rng)
     two = np.stack([color(rng), color(rng)])
     mixed = two[0] * (1 - pattern[..., None]) + two[1] * pattern[..., None]
     grain = 1 + rng.uniform(0, 0.15) * (noise(rng, octaves=6, start=8)[..., None] - 0.5)
-    return np.float32(np.clip(mixed * grain, 0.02, 0.9))
+    return np.clip(mixed * grain, 0.02, 0.9).astype(np.float32)
 
 
 def _axes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -63,25 +63,26 @@ def _plain(rng: Generator) -> Raster:
 
 def _mottled(rng: Generator) -> Raster:
     field = noise(rng, start=int(rng.integers(2, 9)))
-    return np.float32(np.clip((field - 0.5) * rng.uniform(1, 4) + 0.5, 0, 1))
+    return np.clip((field - 0.5) * rng.uniform(1, 4) + 0.5, 0, 1).astype(np.float32)
 
 
 def _checks(rng: Generator) -> Raster:
     u, v = _axes()
     count = rng.integers(2, 10)
-    return np.float32((np.floor(u * count * 2) + np.floor(v * count * 2)) % 2)
+    return ((np.floor(u * count * 2) + np.floor(v * count * 2)) % 2).astype(np.float32)
 
 
 def _stripes(rng: Generator) -> Raster:
     u, v = _axes()
     phase = (u if rng.uniform() < 0.5 else v) * rng.integers(2, 14) + rng.uniform(0, 0.3) * noise(rng)
-    return np.float32(phase % 1 < rng.uniform(0.2, 0.8))
+    return (phase % 1 < rng.uniform(0.2, 0.8)).astype(np.float32)
 
 
 def _dots(rng: Generator) -> Raster:
     u, v = _axes()
     count = rng.integers(3, 12)
-    return np.float32(np.hypot(u * count % 1 - 0.5, v * count % 1 - 0.5) < rng.uniform(0.2, 0.45))
+    away = np.hypot(u * count % 1 - 0.5, v * count % 1 - 0.5)
+    return (away < rng.uniform(0.2, 0.45)).astype(np.float32)
 
 
 def _bricks(rng: Generator) -> Raster:
@@ -89,10 +90,10 @@ def _bricks(rng: Generator) -> Raster:
     rows = 2 * rng.integers(2, 7)
     row = np.floor(v * rows)
     along = (u * rows / 2 + 0.5 * (row % 2)) % 1
-    return np.float32((along < 0.06) | (v * rows % 1 < 0.12))
+    return ((along < 0.06) | (v * rows % 1 < 0.12)).astype(np.float32)
 
 
 def _veins(rng: Generator) -> Raster:
     u, _ = _axes()
     wave = np.sin(2 * np.pi * (rng.integers(1, 5) * u + rng.uniform(0.5, 2.5) * noise(rng)))
-    return np.float32(np.abs(wave) ** rng.uniform(0.3, 2))
+    return (np.abs(wave) ** rng.uniform(0.3, 2)).astype(np.float32)

@@ -1,14 +1,14 @@
 """Triplets (photo, strokes, relit photo) mixed on the fly from renders of single sources, in linear light.
 
-A photo is the sum of its sources' renders, each with a strength and a tint, under one exposure that source and target
-share; its Lumi map is the same sum of their Lumi maps. Three kinds of pair: one light is added, removed or changed
-and the strokes speak of where it matters; all lights are replaced; nothing changes.
+A photo is the sum of its sources' renders, each with a strength and a tint, under one exposure that source
+and target share; its Lumi map is the same sum of their Lumi maps. Three kinds of pair: one light is added,
+removed or changed and the strokes speak of where it matters; all lights are replaced; nothing changes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,8 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
 
+from dior_rt.errors import InputError
+from dior_rt.family import Mode
 from dior_rt.family.mini import MODES
 from dior_rt.kernels import NumpyOps
 from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb
@@ -27,7 +29,7 @@ from dior_rt.training.render import View
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
 Raster = NDArray[np.float32]
 
-GRIDS = ((64, 64), (64, 64), (52, 80), (80, 52), (56, 72), (72, 56))
+GRIDS = ((64, 64), (64, 64), (56, 80), (80, 56), (56, 72), (72, 56))
 KINDS = ("change", "replace", "keep")
 KIND_SHARES = (0.5, 0.38, 0.12)
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
@@ -35,7 +37,7 @@ DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the
 
 @dataclass(frozen=True)
 class Pair:
-    """Photo and relit photo, linear and clipped at display white, with both Lumi maps; all (H, W, 3) float32."""
+    """Photo and relit photo, linear, clipped at display white, and their Lumi maps; all (H, W, 3) float32."""
 
     kind: str
     photo: Raster
@@ -46,19 +48,19 @@ class Pair:
 
 def mix(view: View, lights: Lights) -> tuple[Raster, Raster]:
     """The image and the Lumi map of a view under some lights."""
-    image = np.einsum("khwc,kc->hwc", view.images.astype(np.float32), lights)
-    return image, np.einsum("khwc,kc->hwc", view.lumi.astype(np.float32), lights)
+    image = (view.images * lights[:, None, None]).sum(axis=0, dtype=np.float32)
+    return image, (view.lumi * lights[:, None, None]).sum(axis=0, dtype=np.float32)
 
 
 def tint(rng: Generator) -> Raster:
     """A light's colour, of luminance about 1: white, warm or cool half of the time, else any hue."""
     if rng.uniform() < 0.5:
         warmth = rng.normal(0, 0.25)
-        return np.float32(np.exp([warmth, 0.0, -1.4 * warmth]))
+        return np.exp([warmth, 0.0, -1.4 * warmth]).astype(np.float32)
     hue, saturation = rng.uniform(), rng.uniform(0.2, 1.0)
     ramp = np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
     shade = 1 - saturation * (1 - ramp)
-    return np.float32(shade / max(shade.mean(), 0.4))
+    return (shade / max(shade.mean(), 0.4)).astype(np.float32)
 
 
 def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
@@ -68,7 +70,7 @@ def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
         on = np.zeros_like(usable)
         on[rng.choice(np.flatnonzero(usable))] = True
     strengths = 2 ** rng.uniform(-2, 1, usable.size) * on
-    return np.float32(strengths)[:, None] * np.stack([tint(rng) for _ in usable])
+    return strengths.astype(np.float32)[:, None] * np.stack([tint(rng) for _ in usable])
 
 
 def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lights:
@@ -96,34 +98,29 @@ def exposed(image: Raster, white: float) -> float:
 
 def pair(rng: Generator, view: View) -> Pair:
     """A random pair of one view."""
-    usable = view.lumi.astype(np.float32).mean(axis=(1, 2, 3)) > DIMMEST
+    usable = view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
     kind = str(rng.choice(KINDS, p=KIND_SHARES))
     lights = random_lights(rng, usable)
+    relights = lights
     if kind == "change":
         relights = change_one(rng, lights, usable)
-    else:
-        relights = lights if kind == "keep" else random_lights(rng, usable)
+    elif kind == "replace":
+        relights = random_lights(rng, usable)
     photo, source = mix(view, lights)
     relit, target = mix(view, relights)
-    exposure = exposed(photo, rng.uniform(0.3, 1.1))
-    # Lights so strong that the picture is lost in white teach nothing; a source's strength is free, so weaken all.
-    again = min(exposure, exposed(relit, rng.uniform(0.9, 1.5))) if kind == "change" else 0.0
-    if kind == "change" and again < exposure:
-        exposure = again
+    exposure, strength = exposed(photo, rng.uniform(0.3, 1.1)), 1.0
+    # A picture lost in white teaches nothing. One changed light must stay itself beside the others, so the
+    # exposure gives way to it; lights that replace all others may be as strong as suits.
+    if kind == "change":
+        exposure = min(exposure, exposed(relit, rng.uniform(0.9, 1.5)))
     elif kind == "replace":
         strength = exposed(relit, rng.uniform(0.3, 1.1)) / exposure
-        relit, target = relit * strength, target * strength
     return Pair(
         kind,
-        *(
-            np.float32(raster)
-            for raster in (
-                np.clip(photo * exposure, 0, 1),
-                np.clip(relit * exposure, 0, 1),
-                source * exposure,
-                target * exposure,
-            )
-        ),
+        photo=np.clip(photo * exposure, 0, 1),
+        relit=np.clip(relit * strength * exposure, 0, 1),
+        source=source * exposure,
+        target=target * strength * exposure,
     )
 
 
@@ -135,11 +132,15 @@ def window(rng: Generator, size: int, grid: tuple[int, int]) -> tuple[slice, sli
     return slice(top, top + height), slice(left, left + width), bool(rng.uniform() < 0.5)
 
 
-def resized(raster: Raster, grid: tuple[int, int]) -> Raster:
-    """Antialiased resampling in linear light."""
-    planes = torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1)[None]
-    small = F.interpolate(planes, size=grid, mode="bilinear", antialias=True)
-    return np.ascontiguousarray(small[0].permute(1, 2, 0).clamp_min(0).numpy())
+def zoomed(view: View, rows: slice, columns: slice, mirror: bool, grid: tuple[int, int]) -> View:
+    """A part of a view resampled to the grid, in linear light; its rasters are float32."""
+    renders = np.stack([view.images, view.lumi])[:, :, rows, columns].astype(np.float32)
+    planes = torch.from_numpy(renders).permute(0, 1, 4, 2, 3).flatten(0, 2)[None]
+    small = F.interpolate(planes, size=grid, mode="bilinear", antialias=True).clamp_min(0)
+    if mirror:
+        small = small.flip(3)
+    images, lumi = small.unflatten(1, (2, -1, 3))[0].permute(0, 1, 3, 4, 2).contiguous().numpy()
+    return replace(view, images=images, lumi=lumi)
 
 
 def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
@@ -147,12 +148,12 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     seed = int(rng.integers(2**31))
     if sample.kind == "change" and rng.uniform() < 0.85:
         change = np.abs(np.log((sample.target + 0.02) / (sample.source + 0.02))).max(axis=2)
-        drawn = ops.sparsify(sample.target, "strokes", seed, interest=np.float32(change**2 + 1e-6))
+        drawn = ops.sparsify(sample.target, "strokes", seed, interest=(change**2 + 1e-6).astype(np.float32))
         if rng.uniform() < 0.5:
             # A person's brush lays one colour; a map's own values vary along a stroke.
             inside = drawn.mask > 0
             flat = np.where(inside[..., None], drawn.light[inside].mean(axis=0), 0)
-            return np.float32(flat), drawn.mask
+            return flat.astype(np.float32), drawn.mask
     else:
         mode = ("strokes", "coarse", "dense")[rng.choice(3, p=[0.5, 0.25, 0.25])]
         drawn = ops.sparsify(sample.target, mode, seed)
@@ -161,30 +162,24 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
 
 @dataclass(frozen=True)
 class Mix:
-    """What share of the samples estimates, and what share relights without strokes (the null branch of guidance)."""
+    """The share of samples that estimate; of the others, the share without strokes, for guidance."""
 
     estimate: float = 0.15
     null: float = 0.08
 
 
 class Batches(IterableDataset[dict[str, Tensor]]):
-    """An endless stream of batches; the n-th is the same on every run. Fields are the network's inputs and `x0`.
+    """An endless stream of batches: the network's inputs and `x0`. The n-th is the same on every run.
 
-    rank of ranks: this process's share where several train together.
+    start: the number of the first batch. rank: of this process, where several train together.
     """
 
     def __init__(
         self, views: list[View], batch: int, seed: int, start: int = 0, shares: Mix = Mix(), rank: int = 0
     ) -> None:
         super().__init__()
-        self.views, self.batch, self.seed, self.start, self.shares, self.rank = (
-            views,
-            batch,
-            seed,
-            start,
-            shares,
-            rank,
-        )
+        self.views, self.batch, self.shares = views, batch, shares
+        self.seed, self.rank, self.start = seed, rank, start
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
         number = self.start
@@ -198,22 +193,15 @@ class Batches(IterableDataset[dict[str, Tensor]]):
         return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
 
     def _sample(self, rng: Generator, grid: tuple[int, int]) -> dict[str, Tensor]:
-        whole = pair(rng, self.views[rng.integers(len(self.views))])
-        rows, columns, mirror = window(rng, whole.photo.shape[0], grid)
-        step = -1 if mirror else 1
-        parts = (
-            resized(r[rows, columns][:, ::step], grid)
-            for r in (whole.photo, whole.relit, whole.source, whole.target)
-        )
-        small = Pair(whole.kind, *parts)
+        view = self.views[rng.integers(len(self.views))]
+        small = pair(rng, zoomed(view, *window(rng, view.images.shape[1], grid), grid))
         if rng.uniform() < self.shares.estimate:
             return example(small, None, "estimate")
-        return example(
-            small, None if rng.uniform() < self.shares.null else draw(rng, NumpyOps(), small), "relight"
-        )
+        strokes = None if rng.uniform() < self.shares.null else draw(rng, NumpyOps(), small)
+        return example(small, strokes, "relight")
 
 
-def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: str) -> dict[str, Tensor]:
+def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: Mode) -> dict[str, Tensor]:
     """The network's inputs for a pair, and x0: what it should find."""
 
     def planes(raster: Raster) -> Tensor:
@@ -230,16 +218,16 @@ def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: str) -> d
         "photo": photo,
         "light": planes(light),
         "mask": planes(mask[..., None]),
-        "mode": torch.tensor(MODES[mode]),  # type: ignore[index]
+        "mode": torch.tensor(MODES[mode]),
         "x0": x0,
     }
 
 
 def load_views(folder: Path) -> list[View]:
-    """All views of a folder of renders, in memory (half a megabyte each). Raises ValueError where there is none."""
+    """All views of a folder of renders, half a megabyte each. Raises InputError if there is none."""
     paths = sorted(folder.glob("*-*.npz"))
     if not paths:
-        raise ValueError(
-            f"there are no renders in {folder}; make some with `dior-rt train render --out {folder}`"
+        raise InputError(
+            f"There are no renders in {folder}; make some with `dior-rt train render --out {folder}`."
         )
     return [View.load(path) for path in paths]
