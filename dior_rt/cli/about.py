@@ -1,15 +1,14 @@
-"""The commands that tell what is there, and the one that makes a bundle."""
+"""The commands that tell what is there."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from dior_rt.cli import options
-from dior_rt.cli.extras import needs_extra
 
 
 def info(
@@ -46,31 +45,6 @@ def info(
         **{f"parity {name}": f"{value:.4g}" for name, value in manifest.parity.items()},
     }
     _table(list(rows.items()))
-
-
-def export(
-    checkpoint: Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="A folder that training wrote.")],
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="BUNDLE", help="The folder to make.")],
-    lora: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="A LoRA of the checkpoint, to be merged.")
-    ] = None,
-    weights: Annotated[Literal["fp16", "fp32"], typer.Option(help="How the weights are stored.")] = "fp16",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bundle at BUNDLE.")] = False,
-    debug: options.Debug = False,
-) -> None:
-    """Make a bundle of a trained checkpoint.
-
-    The LoRA is merged, the network converted to ONNX and compared with torch; where they differ, nothing is
-    written. Needs pip install 'dior-rt[export]'.
-
-    \b
-      dior-rt export runs/mini/step-9000 --lora runs/mini-lora -o bundles/mini
-    """
-    with needs_extra("export"):
-        from dior_rt.export import export_checkpoint
-
-        bundle = export_checkpoint(checkpoint, out, lora=lora, weights=weights, overwrite=overwrite)
-    _table([(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()])
 
 
 def _table(rows: list[tuple[str, object]]) -> None:

@@ -9,11 +9,14 @@ from dior_rt.errors import MissingExtraError
 
 
 @contextmanager
-def needs_extra(name: str) -> Iterator[None]:
-    """Turn a package that is missing in the block into MissingExtraError; name: of command and extra."""
+def needs_extra(name: str, command: str | None = None) -> Iterator[None]:
+    """Turn a package that is missing in the block into MissingExtraError.
+
+    name: of the extra, and of the command unless that is given.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] == "dior_rt":  # ours is never missing but by mistake
             raise
-        raise MissingExtraError(name, name) from error
+        raise MissingExtraError(command or name, name) from error

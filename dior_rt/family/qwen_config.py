@@ -58,9 +58,9 @@ class TextSettings:
 class QwenSettings:
     """The model's sizes.
 
-    area, multiple: the rule for the size of the pictures, in pixels. factor: pixels a latent; patch: latents a
-    token, each way. axes: how many of a head's numbers turn with frame, row and column. reference_at_zero: the
-    reference pictures are modulated as at sigma = 0. fixed_sigmas: the only schedule that the bundle has
+    area, multiple: the rule for the size of the pictures, in pixels. factor: pixels a latent; patch: latents
+    a token, each way. axes: how many of a head's numbers turn with frame, row and column. reference_at_zero:
+    the reference pictures are modulated as at sigma = 0. fixed_sigmas: the only schedule that the bundle has
     modulation for; empty where it can compute any. lumi_peak: the light that is drawn as white. text: None
     where the prompts' embeddings are in `prompts.npz` themselves.
     """

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from dior_rt.bundle import Bundle, Graph, Manifest, write_bundle
+from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
 from dior_rt.errors import BundleError
 from dior_rt.export.qwen.errors import check_block, compare
 from dior_rt.export.qwen.graph import Precision
@@ -47,8 +47,8 @@ class Recipe:
     does unless told otherwise. schedule: None takes the model's.
 
     free_steps: keep the weights that compute modulation, a third of the transformer, so that any number of
-    steps can be run; without them the bundle is for `steps` alone. prompt_cache: store the prompts' embeddings,
-    computed without the pictures, and leave the text encoder out; for LoRAs that were trained so.
+    steps can be run; without them the bundle is for `steps` alone. prompt_cache: store the prompts'
+    embeddings, computed without the pictures, and leave the text encoder out; for LoRAs trained so.
 
     area, vision_area: pixels of the pictures that the bundle paints, and that its prompts' encoder sees.
     probe_area: of the picture by which the cost of a precision is measured.
@@ -88,6 +88,7 @@ def export_qwen(
     Raises InputError for what cannot be exported, ExportError where a graph computes something else than
     torch, and BundleError where nothing can be written. Nothing is left at `out` then.
     """
+    check_target(out, overwrite)
     sources = Sources(folder, loras, transformer)
     schedule = recipe.schedule or sources.schedule()
     _check_room(sources, recipe, out)

@@ -69,6 +69,13 @@ def load_block(config: TransformerConfig, weights: Weights, index: int) -> QwenI
     return block.eval()
 
 
+def empty_block(config: TransformerConfig) -> QwenImageTransformerBlock:
+    """One of diffusers' blocks that has shapes and no memory."""
+    heads, width = config.num_attention_heads, config.attention_head_dim
+    with torch.device("meta"):
+        return QwenImageTransformerBlock(config.width, heads, width, zero_cond_t=config.zero_cond_t)
+
+
 def block_inputs(
     config: TransformerConfig,
     block: QwenImageTransformerBlock,

@@ -1,8 +1,8 @@
 """Modulation: what the transformer's blocks are told of sigma, a third of the model's weights.
 
-    time        sigma (R,)     -> embedding (R, D)       SiLU(MLP(sinusoids of 1000 sigma))
-    block.NN    embedding      -> rows (R, 12, D)        image, then text: shift, scale, gate, shift, scale,
-    gate head        embedding      -> rows (R, 2, D)         scale, shift
+    time        sigma (R,)     -> embedding (R, D)    SiLU(MLP(sinusoids of 1000 sigma))
+    block.NN    embedding      -> rows (R, 12, D)     image, then text: shift, scale, gate, twice
+    head        embedding      -> rows (R, 2, D)      scale, shift
 
 None of it depends on the picture, so a bundle for one schedule carries the rows in a table (R, 12 layers + 2,
 D) and not these graphs. All of it is float32 in every precision.

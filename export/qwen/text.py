@@ -1,10 +1,10 @@
 """The graphs of Qwen2.5-VL, as the encoder of a prompt and its pictures, one graph a layer.
 
-    vision.embed       patches (P, 1176)                              -> x (P, V)
-    vision.block.NN    x, cos, sin (P, d/2), groups (P,)              -> x        attention within equal
-    groups vision.merge       x                                              -> features (P / 4, D)
-    text.block.NN      x (T, D), cos, sin (T, d/2)                    -> x        causal, grouped keys
-    text.norm          x                                              -> x
+    vision.embed       patches (P, 1176)                     -> x (P, V)
+    vision.block.NN    x, cos, sin (P, d/2), groups (P,)     -> x           attention within equal groups
+    vision.merge       x                                     -> features (P / 4, D)
+    text.block.NN      x (T, D), cos, sin (T, d/2)           -> x           causal, grouped keys
+    text.norm          x                                     -> x
 
 The patches come in the order of the vision windows; the runtime sorts them, and looks up the few rows of the
 embedding that the fixed prompts need, so that the table of all words stays behind.

@@ -1,7 +1,7 @@
 """The graphs of AutoencoderKLQwenImage, a video autoencoder, as the network that it is on a single picture.
 
-    encoder     pixels (1, 3, 8 h, 8 w) in -1..1      -> latents (1, z, h, w): the posterior's mean,
-    normalised decoder     latents (1, z, h, w), normalised      -> pixels (1, 3, 8 h, 8 w), clipped to -1..1
+    encoder    pixels (1, 3, 8 h, 8 w) in -1..1    -> latents (1, z, h, w): the posterior's mean, normalised
+    decoder    latents (1, z, h, w), normalised    -> pixels (1, 3, 8 h, 8 w), clipped to -1..1
 
 Its convolutions run over time too, causally: a picture's past is zeros, so only the last of the three slices
 of each kernel meets anything else. Keeping that slice turns every 3-D convolution into a 2-D one, a third of

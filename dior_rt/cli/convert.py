@@ -1,0 +1,115 @@
+"""The command that makes a bundle, of a network that was trained here or of Qwen-Image-Edit."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from dior_rt.cli import options
+from dior_rt.cli.extras import needs_extra
+from dior_rt.errors import InputError
+
+Precision = Literal["fp32", "fp16", "int8", "int4"]
+
+
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="A checkpoint of training, or Qwen-Image-Edit as diffusers has it."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="BUNDLE", help="The folder to make.")],
+    lora: Annotated[
+        list[str], typer.Option(metavar="PATH[:STRENGTH]", help="A LoRA to be merged; may be repeated.")
+    ] = [],  # noqa: B006 - typer copies it
+    weights: Annotated[
+        Precision, typer.Option("--weights", "--precision", help="How the weights are stored.")
+    ] = "fp16",
+    steps: Annotated[
+        int | None, typer.Option(min=1, max=1000, help="Qwen: steps of the bundle [40].")
+    ] = None,
+    few_steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=1000, help="Qwen with a few-step LoRA: its steps; no guidance, its own schedule."
+        ),
+    ] = None,
+    free_steps: Annotated[
+        bool, typer.Option("--free-steps", help="Qwen: keep what other numbers of steps need, a third more.")
+    ] = False,
+    prompt_cache: Annotated[
+        bool,
+        typer.Option(
+            "--prompt-cache", help="Qwen: store the prompts' embeddings, and leave their encoder out."
+        ),
+    ] = False,
+    transformer: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Qwen: the transformer's weights in one safetensors file."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bundle at BUNDLE.")] = False,
+    debug: options.Debug = False,
+) -> None:
+    """Make a bundle of a trained checkpoint, or of Qwen-Image-Edit with LoRAs.
+
+    LoRAs are merged, the network is converted to ONNX and compared with torch; where they differ, nothing is
+    written. Needs pip install 'dior-rt[export]', or for Qwen 'dior-rt[qwen]'.
+
+    \b
+      dior-rt export runs/mini/step-9000 --lora runs/mini-lora -o bundles/mini
+      dior-rt export Qwen-Image-Edit-2511 --lora dior.safetensors --weights int8 -o bundles/qwen
+      dior-rt export Qwen-Image-Edit-2511 --lora dior.safetensors --lora lightning.safetensors:0.9 \\
+          --few-steps 8 -o bundles/qwen-fast
+    """
+    if (source / "model_index.json").is_file():
+        with needs_extra("qwen", command="export"):
+            from dior_rt.export.qwen.bundle import Recipe, export_qwen
+            from dior_rt.export.qwen.lora import Lora
+
+            recipe = Recipe(
+                precision=weights, steps=steps or 40, free_steps=free_steps, prompt_cache=prompt_cache
+            )
+            bundle = export_qwen(
+                source,
+                out,
+                recipe.few_steps(few_steps) if few_steps else recipe,
+                loras=[Lora(*_path_and_strength(one)) for one in lora],
+                transformer=transformer,
+                overwrite=overwrite,
+                progress=_show,
+            )
+    else:
+        if steps or few_steps or free_steps or prompt_cache or transformer or weights in ("int8", "int4"):
+            raise InputError(f"{source} is no Qwen-Image-Edit, and these options are for that.")
+        if len(lora) > 1:
+            raise InputError("A checkpoint of training takes one LoRA.")
+        with needs_extra("export"):
+            from dior_rt.export import export_checkpoint
+
+            merged = Path(lora[0]) if lora else None
+            bundle = export_checkpoint(
+                source, out, lora=merged, weights="fp32" if weights == "fp32" else "fp16", overwrite=overwrite
+            )
+    rows = [(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()]
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        typer.echo(f"{name:<{width}}  {value}")
+
+
+def _path_and_strength(text: str) -> tuple[Path, float]:
+    """FILE or FILE:STRENGTH; a colon that no number follows is part of the name."""
+    path, _, strength = text.rpartition(":")
+    try:
+        return (Path(path), float(strength)) if path else (Path(text), 1.0)
+    except ValueError:
+        return Path(text), 1.0
+
+
+def _show(file: str) -> None:
+    """Tell of a part that is written, where somebody watches: a whole model takes hours."""
+    if sys.stderr.isatty():
+        typer.echo(f"written: {file}", err=True)

@@ -1,0 +1,180 @@
+"""One block of the released model's width, measured; and what follows from it for the whole model.
+
+    python -m dior_rt.export.qwen.measure --side 512 --runs 3 --threads 2
+
+Writes a block with random weights in each precision, runs it in ONNX Runtime and in torch on the same inputs,
+in turn, and prints seconds, error and size. The projection multiplies: blocks x branches x steps for time,
+blocks x bytes for memory. The figures for GPUs are arithmetic from their data sheets, not measurements.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+import torch
+
+from dior_rt.engine import Engine
+from dior_rt.export.qwen.errors import block_inputs, empty_block, load_block, relative, run_block
+from dior_rt.export.qwen.graph import PRECISIONS, Precision
+from dior_rt.export.qwen.transformer import TransformerConfig, write_block
+from dior_rt.export.qwen.weights import Array
+from dior_rt.family.qwen_frame import fit_area
+
+RELEASED: Final = TransformerConfig(
+    in_channels=64,
+    out_channels=16,
+    num_layers=60,
+    attention_head_dim=128,
+    num_attention_heads=24,
+    joint_attention_dim=3584,
+    axes_dims_rope=(16, 56, 56),
+    zero_cond_t=True,
+)
+WORDS: Final = 480  # a prompt of some 90 words, and two pictures of 14 x 14 features
+STEPS: Final = 40
+BRANCHES: Final = 2
+USED: Final = 0.4  # of a GPU's peak, which large matrices reach in practice
+
+# Memory in GB, dense fp16 TFLOP/s with fp32 accumulation; from the makers' data sheets.
+GPUS: Final = {
+    "NVIDIA RTX 4090": (24, 165.0),
+    "NVIDIA A100 80 GB": (80, 312.0),
+    "NVIDIA H100 SXM": (80, 989.0),
+    "AMD MI300X": (192, 1307.0),
+}
+
+
+class RandomWeights:
+    """Weights of the shapes that a block has, made when they are asked for; the same name, the same weights."""
+
+    def __init__(self, config: TransformerConfig, index: int) -> None:
+        block = empty_block(config)
+        self._shapes = {
+            f"transformer_blocks.{index}.{n}": tuple(w.shape) for n, w in block.state_dict().items()
+        }
+
+    @property
+    def count(self) -> int:
+        return sum(math.prod(shape) for shape in self._shapes.values())
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        return self._shapes[name]
+
+    def __getitem__(self, name: str) -> Array:
+        shape = self._shapes[name]
+        noise = np.random.default_rng(list(name.encode())).standard_normal(shape, dtype=np.float32)
+        if len(shape) == 2:
+            return noise / np.float32(math.sqrt(shape[1]))
+        return noise * np.float32(0.02) + np.float32("norm" in name)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A block in one precision: median seconds a run here and in torch, its error, bytes of its weights."""
+
+    precision: Precision
+    seconds: float
+    torch_seconds: float
+    error: float
+    bytes: int
+
+
+def measure(
+    config: TransformerConfig,
+    sizes: Sequence[tuple[int, int]],
+    runs: int,
+    threads: int | None,
+    precisions: Sequence[Precision],
+) -> list[Measured]:
+    """Measure one block in each precision, its runs taking turns with torch's."""
+    weights = RandomWeights(config, 0)
+    block = load_block(config, weights, 0)
+    feeds, inputs = block_inputs(config, block, seed=0, words=WORDS, sizes=tuple(sizes))
+    given, want = np.concatenate([feeds["text"], feeds["image"]]), run_block(block, inputs)
+    measured = []
+    with tempfile.TemporaryDirectory() as scratch:
+        for precision in precisions:
+            path = Path(scratch) / f"{precision}.onnx"
+            write_block(path, config, weights, 0, precision)
+            engine = Engine(path, "cpu", threads)
+            made = engine.run(feeds)
+            got = np.concatenate([made["text_out"], made["image_out"]])
+            here, torch_here = [], []
+            for _ in range(runs):
+                here.append(seconds(partial(engine.run, feeds)))
+                torch_here.append(seconds(partial(run_block, block, inputs)))
+            error = relative(got - given, want - given)
+            size = path.with_suffix(".data").stat().st_size
+            measured.append(Measured(precision, median(here), median(torch_here), error, size))
+            path.with_suffix(".data").unlink()
+    return measured
+
+
+def seconds(run: Callable[[], object]) -> float:
+    """How long one call takes."""
+    start = perf_counter()
+    run()
+    return perf_counter() - start
+
+
+def flops(config: TransformerConfig, image: int, text: int) -> float:
+    """Floating point operations of one block, one branch: its matrix products and its attention."""
+    width, tokens = config.width, image + text
+    projections = 2 * tokens * (4 * width**2 + 8 * width**2)
+    attention = 4 * tokens**2 * width
+    return float(projections + attention)
+
+
+def report(measured: Sequence[Measured], tokens: int) -> str:
+    """The figures as text, with what they mean for the whole model."""
+    operations, weights = flops(RELEASED, tokens, WORDS), RandomWeights(RELEASED, 0).count
+    lines = [
+        f"one block: {weights / 1e6:.0f} M weights, {tokens} + {WORDS} tokens, {operations / 1e12:.2f} TFLOP",
+        "precision  seconds  in torch  error    weights  | 60 blocks, 40 steps, guidance",
+    ]
+    for m in measured:
+        size, runs = RELEASED.num_layers * m.bytes / 1e9, RELEASED.num_layers * STEPS * BRANCHES
+        lines.append(
+            f"{m.precision:9}  {m.seconds:7.2f}  {m.torch_seconds:8.2f}  {m.error:.1e}  {m.bytes / 1e9:4.2f} GB"
+            f"  | {size:5.1f} GB  {runs * m.seconds / 3600:6.1f} h"
+        )
+    total = operations * RELEASED.num_layers * STEPS * BRANCHES
+    for name, (memory, tflops) in GPUS.items():
+        seconds = total / (tflops * 1e12 * USED)
+        lines.append(f"on paper: {name}, {memory} GB: {seconds:.0f} s in fp16 at {USED:.0%} of its peak")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measure one block of the released model's width.")
+    parser.add_argument(
+        "--side", type=int, default=512, help="of the picture and its two references, in pixels"
+    )
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--threads", type=int)
+    parser.add_argument("--precisions", nargs="+", choices=PRECISIONS, default=["fp32", "int8", "int4"])
+    parser.add_argument("--json", type=Path, help="also write the figures there")
+    options = parser.parse_args()
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    rows, columns = (side // 16 for side in fit_area(options.side**2, 1, 1, 32))
+    measured = measure(RELEASED, [(rows, columns)] * 3, options.runs, options.threads, options.precisions)
+    print(report(measured, 3 * rows * columns))
+    if options.json:
+        text = json.dumps([asdict(one) for one in measured], indent=2)
+        options.json.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
