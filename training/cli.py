@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -83,6 +85,35 @@ def lora(
     plan = Plan(steps, batch, rate, warmup=50, seed=seed, precision=precision)
     with _Bar(steps) as bar:
         fit_lora(base, renders, out, rank, plan, bar.show)
+
+
+@app.command(name="eval")
+def evaluate(
+    bundle: Annotated[Path, typer.Argument(help="Folder of the bundle.")],
+    renders: Annotated[Path, typer.Argument(help="Folder of renders that training has not seen.")],
+    views: Annotated[int, typer.Option(min=1, help="How many views at most.")] = 80,
+    steps: Annotated[int | None, typer.Option(min=1, help="Also with so many steps.")] = None,
+    guidance: Annotated[float | None, typer.Option(min=0, help="Also with this guidance.")] = None,
+    noise_scale: Annotated[float | None, typer.Option(min=0, help="Also from noise so strong.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of a table.")] = False,
+) -> None:
+    """Measure how well a bundle relights held-out renders, beside copying the source.
+
+    With the bundle's own settings, and once more with those given.
+    """
+    from dior_rt.relight import Relighter
+    from dior_rt.training.evaluate import Settings, evaluate, markdown
+    from dior_rt.training.triplets import load_views
+
+    relighter, held_out = Relighter(bundle), load_views(renders)[:views]
+    asked = dict.fromkeys(
+        [Settings(), Settings(steps, guidance, noise_scale)]
+    )  # once where they are the same
+    evaluations = [evaluate(relighter, held_out, settings) for settings in asked]
+    if as_json:
+        typer.echo(json.dumps([asdict(evaluation) for evaluation in evaluations], indent=2))
+    else:
+        typer.echo("\n\n".join(markdown(evaluation) for evaluation in evaluations))
 
 
 class _Bar:

@@ -31,15 +31,17 @@ LORA: Final = "lora"
 LORA_TARGETS: Final = ["qkv", "proj", "up", "down", "modulation", "unembed"]
 
 Progress = Callable[[int, float], None]  # step, running loss
+Prepare = Callable[[dict[str, Tensor]], dict[str, Tensor]]
 
 
 @dataclass(frozen=True)
 class Plan:
     """How to train.
 
-    The rate warms up, stays, and falls to 0 over the last fifth of the steps, so a longer plan can resume from
-    any state that came before the fall. average: the half-life of the weights' average, in steps. clip: the largest norm of a gradient. shift,
-    always_noise: how flow times are drawn, see `draw_sigma`. precision: as accelerate names it.
+    The rate warms up, stays, and falls to 0 over the last fifth of the steps, so a longer plan can resume
+    from any state that came before the fall. average: the half-life of the weights' average, in steps.
+    clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. precision:
+    as accelerate names it.
     """
 
     steps: int
@@ -119,8 +121,12 @@ def _run(
     plan: Plan,
     progress: Progress | None,
     save: Callable[[nn.Module], None],
+    prepare: Prepare = lambda batch: batch,
 ) -> None:
-    """Train to the plan's end; every so often `save` receives the network with its averaged weights."""
+    """Train to the plan's end; every so often `save` receives the network with its averaged weights.
+
+    prepare: makes of a batch of triplets what the network's data variable is.
+    """
     views = load_views(renders)
     make_folder(out)
     accelerator = Accelerator(mixed_precision=plan.precision)
@@ -135,7 +141,8 @@ def _run(
     loader = DataLoader(batches, batch_size=None, num_workers=1, prefetch_factor=4)
     running = math.nan
     for batch in islice(loader, max(plan.steps - state.step, 0)):
-        loss = _step(accelerator, network, state, batch, plan)
+        moved = {name: value.to(accelerator.device) for name, value in batch.items()}
+        loss = _step(accelerator, network, state, prepare(moved), plan)
         running = loss if math.isnan(running) else 0.98 * running + 0.02 * loss
         if progress:
             progress(state.step, running)
@@ -155,9 +162,8 @@ def _step(
     generator = torch.Generator().manual_seed(seed)  # the host's, so that a seed means the same everywhere
     sigma = draw_sigma(len(batch["x0"]), plan, generator).to(accelerator.device)
     noise = torch.randn(batch["x0"].shape, generator=generator).to(accelerator.device)
-    moved = {name: value.to(accelerator.device) for name, value in batch.items()}
     with accelerator.autocast():
-        loss = flow_loss(network, moved, sigma, noise)
+        loss = flow_loss(network, batch, sigma, noise)
     accelerator.backward(loss)
     accelerator.clip_grad_norm_(state.weights, plan.clip)
     state.optimizer.step()

@@ -96,10 +96,10 @@ def exposed(image: Raster, white: float) -> float:
     return white / max(float(np.percentile(image.max(axis=2), 95)), 1e-4)
 
 
-def pair(rng: Generator, view: View) -> Pair:
-    """A random pair of one view."""
+def pair(rng: Generator, view: View, kind: str | None = None) -> Pair:
+    """A random pair of one view, of the given kind or of any."""
     usable = view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
-    kind = str(rng.choice(KINDS, p=KIND_SHARES))
+    kind = kind or str(rng.choice(KINDS, p=KIND_SHARES))
     lights = random_lights(rng, usable)
     relights = lights
     if kind == "change":
@@ -143,12 +143,17 @@ def zoomed(view: View, rows: slice, columns: slice, mirror: bool, grid: tuple[in
     return replace(view, images=images, lumi=lumi)
 
 
+def interest(sample: Pair) -> Raster:
+    """(h, w) where a person would draw: where the light changes most."""
+    change = np.abs(np.log((sample.target + 0.02) / (sample.source + 0.02))).max(axis=2)
+    return (change**2 + 1e-6).astype(np.float32)
+
+
 def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     """Light (h, w, 3) and mask (h, w) that a person might have drawn for the pair, at grid size."""
     seed = int(rng.integers(2**31))
     if sample.kind == "change" and rng.uniform() < 0.85:
-        change = np.abs(np.log((sample.target + 0.02) / (sample.source + 0.02))).max(axis=2)
-        drawn = ops.sparsify(sample.target, "strokes", seed, interest=(change**2 + 1e-6).astype(np.float32))
+        drawn = ops.sparsify(sample.target, "strokes", seed, interest=interest(sample))
         if rng.uniform() < 0.5:
             # A person's brush lays one colour; a map's own values vary along a stroke.
             inside = drawn.mask > 0

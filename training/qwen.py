@@ -1,0 +1,188 @@
+"""A LoRA on Qwen-Image-Edit, trained with the same triplets, loss and loop as mini.
+
+The loop knows a backbone by two things: `prepare`, which turns a batch of triplets into the backbone's data
+variable and inputs, and a network that is called with x, sigma, photo, light, mask and mode. Here the data
+variable is the latents of the picture to be painted, photo and light are the latents of the two references,
+and the network is diffusers' transformer with peft's LoRA. The prompts are embedded once, without pictures,
+so the LoRA belongs in a bundle with a prompt cache.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from diffusers import AutoencoderKLQwenImage, QwenImageEditPlusPipeline, QwenImageTransformer2DModel
+from peft import LoraConfig, get_peft_model_state_dict
+from torch import Tensor, nn
+from torch.nn import functional as F
+from transformers import Qwen2_5_VLForConditionalGeneration, Qwen2Tokenizer
+
+from dior_rt.errors import InputError
+from dior_rt.family.mini import MODES
+from dior_rt.family.qwen_config import LUMI_PEAK, LUMI_SCALE
+from dior_rt.family.qwen_frame import fit_area
+from dior_rt.files import make_folder, reason
+from dior_rt.training.fit import Plan, Progress, _run
+from dior_rt.training.network import RELIT_SCALE, decode_light
+
+MULTIPLE: Final = 32
+ADAPTER: Final = "light"
+TARGETS: Final = [
+    *(f"to_{role}" for role in ("q", "k", "v", "out.0", "add_out")),
+    *(f"add_{role}_proj" for role in "qkv"),
+    *(f"{stream}_mlp.net.{layer}" for stream in ("img", "txt") for layer in ("0.proj", "2")),
+]
+
+UNREAD: Final = ["attn.add_q_proj", "attn.to_add_out", "txt_mlp.net.0.proj", "txt_mlp.net.2"]
+
+
+class Qwen(nn.Module):
+    """The transformer with its LoRA: velocity of latents (B, z, h, w) under references of the same shape."""
+
+    def __init__(
+        self, transformer: QwenImageTransformer2DModel, prompts: dict[int, Tensor], rank: int
+    ) -> None:
+        """transformer: a QwenImageTransformer2DModel. prompts: mode -> embeddings (T, D). Only the LoRA learns."""
+        super().__init__()
+        self.transformer = transformer.requires_grad_(False)
+        self.transformer.enable_gradient_checkpointing()
+        last = f"transformer_blocks.{len(transformer.transformer_blocks) - 1}."
+        self.lora = LoraConfig(
+            r=rank,
+            lora_alpha=rank,
+            target_modules=TARGETS,
+            # What the last block does to the words reaches no output.
+            exclude_modules=[last + name for name in UNREAD],
+            init_lora_weights="gaussian",
+        )
+        self.transformer.add_adapter(self.lora, adapter_name=ADAPTER)
+        self.prompts = nn.ParameterDict({str(k): nn.Parameter(v, False) for k, v in prompts.items()})
+
+    def forward(
+        self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
+    ) -> Tensor:
+        """mask is in the light already, and not looked at."""
+        samples = zip(x, sigma, photo, light, mode.tolist(), strict=True)
+        return torch.stack([self._one(*sample) for sample in samples])
+
+    def _one(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mode: int) -> Tensor:
+        """Sample by sample: the modes differ in their prompts' lengths and in how many references they have."""
+        pictures = [x, photo, light] if mode == MODES["relight"] else [x, photo]
+        channels, rows, columns = x.shape
+        tokens = torch.cat([pack(picture) for picture in pictures])
+        velocity = self.transformer(
+            hidden_states=tokens[None],
+            encoder_hidden_states=self.prompts[str(mode)][None],
+            timestep=sigma[None],
+            img_shapes=[[(1, rows // 2, columns // 2)] * len(pictures)],
+            return_dict=False,
+        )[0][0, : rows * columns // 4]
+        return unpack(velocity, rows // 2, columns // 2)
+
+    def save(self, folder: Path) -> None:
+        """Write the LoRA as diffusers reads it, pytorch_lora_weights.safetensors with its settings."""
+        QwenImageEditPlusPipeline.save_lora_weights(
+            folder,
+            transformer_lora_layers=get_peft_model_state_dict(self.transformer, adapter_name=ADAPTER),
+            transformer_lora_adapter_metadata=self.lora.to_dict(),
+        )
+
+
+class Pictures:
+    """An AutoencoderKLQwenImage: batches of triplets to batches of latents of some `area` pixels."""
+
+    def __init__(self, vae: Any, area: int) -> None:
+        self.vae, self.area = vae.requires_grad_(False).eval(), area
+        self.mean, self.std = (
+            torch.tensor(values)[:, None, None]
+            for values in (vae.config.latents_mean, vae.config.latents_std)
+        )
+
+    def prepare(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """photo, light, mask, mode and x0 of mini -> the same names, in latents."""
+        photo, mode = batch["photo"], batch["mode"][:, None, None, None]
+        relit = photo + batch["x0"] / RELIT_SCALE
+        lumi = draw(decode_light((batch["x0"] + 1) / 2))
+        painted = torch.where(mode == MODES["relight"], relit, lumi)
+        light = draw(batch["light"]) * (batch["mask"] > 0)
+        latents = {"x0": painted, "photo": photo, "light": light}
+        return {**batch, **{name: self.encode(picture) for name, picture in latents.items()}}
+
+    @torch.no_grad()
+    def encode(self, pictures: Tensor) -> Tensor:
+        """sRGB 0..1 (B, 3, h, w), resized to the area -> latents (B, z, h', w'), normalised."""
+        size = fit_area(self.area, pictures.shape[2], pictures.shape[3], MULTIPLE)
+        pixels = F.interpolate(pictures.clamp(0, 1), size, mode="bicubic", antialias=True).clamp(0, 1)
+        self.vae.to(pixels.device)
+        latents = self.vae.encode(2 * pixels[:, :, None] - 1).latent_dist.mode()[:, :, 0]
+        return (latents - self.mean.to(latents)) / self.std.to(latents)
+
+
+def fit_qwen_lora(
+    folder: Path,
+    renders: Path,
+    out: Path,
+    rank: int,
+    plan: Plan,
+    prompts: dict[int, Tensor],
+    area: int = 512**2,
+    progress: Progress | None = None,
+) -> None:
+    """Train a LoRA on a diffusers folder of Qwen-Image-Edit; `out` receives it, and a state to resume from.
+
+    prompts: mode -> embeddings (T, D), as `embed_prompts` makes them. Raises InputError.
+    """
+    torch.manual_seed(plan.seed)
+    try:
+        transformer = QwenImageTransformer2DModel.from_pretrained(folder / "transformer")
+        vae = AutoencoderKLQwenImage.from_pretrained(folder / "vae")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"Cannot read the model in {folder}: {reason(error)}.") from error
+    make_folder(out)
+
+    def save(network: nn.Module) -> None:
+        assert isinstance(network, Qwen)
+        network.save(out)
+
+    network = Qwen(transformer, prompts, rank)
+    _run(network, renders, out, plan, progress, save, Pictures(vae, area).prepare)
+
+
+@torch.no_grad()
+def embed_prompts(folder: Path, said: dict[int, str], template: str, skip: int) -> dict[int, Tensor]:
+    """The embeddings (T, D) of each mode's prompt in the model's template, less its first `skip` words.
+
+    Raises InputError where the folder has no text encoder.
+    """
+    try:
+        tokenizer = Qwen2Tokenizer.from_pretrained(folder / "tokenizer")
+        encoder = Qwen2_5_VLForConditionalGeneration.from_pretrained(folder / "text_encoder")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"Cannot read the text encoder in {folder}: {reason(error)}.") from error
+    embeddings = {}
+    for mode, words in said.items():
+        tokens = tokenizer(template.format(words), return_tensors="pt")
+        hidden = encoder(**tokens, output_hidden_states=True).hidden_states[-1]
+        embeddings[mode] = hidden[0, skip:].clone()
+    return embeddings
+
+
+def draw(light: Tensor) -> Tensor:
+    """Light as a picture 0..1, as the runtime draws it: log(1 + 8 L) / log(1 + 8 peak)."""
+    return (torch.log1p(LUMI_SCALE * light) / math.log1p(LUMI_SCALE * LUMI_PEAK)).clamp(0, 1)
+
+
+def pack(latents: Tensor) -> Tensor:
+    """(z, h, w) -> tokens of 2 x 2, (h w / 4, 4 z), row by row."""
+    channels, rows, columns = latents.shape
+    split = latents.reshape(channels, rows // 2, 2, columns // 2, 2)
+    return split.permute(1, 3, 0, 2, 4).reshape(-1, 4 * channels)
+
+
+def unpack(tokens: Tensor, rows: int, columns: int) -> Tensor:
+    """The inverse of `pack`, for tokens of rows x columns."""
+    split = tokens.reshape(rows, columns, -1, 2, 2).permute(2, 0, 3, 1, 4)
+    return split.reshape(-1, 2 * rows, 2 * columns)
