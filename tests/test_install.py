@@ -47,14 +47,15 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("venv")
     venv.create(folder, with_pip=True)
     commands = folder / ("Scripts" if os.name == "nt" else "bin")
-    subprocess.run([commands / "python", "-m", "pip", "install", "--quiet", wheel], check=True)
+    installing = run(commands / "python", "-m", "pip", "install", "--quiet", wheel, cwd=folder)
+    assert installing.returncode == 0, installing.stderr
     return commands
 
 
 def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess:
     """A command that knows nothing of this repository or of the environment of the tests."""
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=600)
 
 
 def test_the_wheel_holds_every_part_and_nothing_else(wheel: Path) -> None:
