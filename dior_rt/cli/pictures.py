@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
@@ -71,12 +72,13 @@ def relight(
 
     out = out or photo.with_name(f"{photo.stem}-relit.png")
     _refuse_same(out, photo, strokes)
-    picture = read_photo(photo)
-    check_output(out, picture)
-    drawing = read_strokes(strokes, picture.size, key)
-    watch.lap("read")
-    relighter = _load(bundle, device, ops)
-    watch.lap("load")
+    with _loading(bundle, device, ops) as load:
+        picture = read_photo(photo)
+        check_output(out, picture)
+        drawing = read_strokes(strokes, picture.size, key)
+        watch.lap("read")
+        relighter = load()
+        watch.lap("load")
     with _progress("Relighting") as advance:
         relit = relighter.relight(
             picture.pixels,
@@ -129,11 +131,12 @@ def estimate(
 
     out = out or photo.with_name(f"{photo.stem}-lumi.exr")
     _refuse_same(out, photo)
-    picture = read_photo(photo)
-    check_lumi_output(out)
-    watch.lap("read")
-    relighter = _load(bundle, device, ops)
-    watch.lap("load")
+    with _loading(bundle, device, ops) as load:
+        picture = read_photo(photo)
+        check_lumi_output(out)
+        watch.lap("read")
+        relighter = load()
+        watch.lap("load")
     with _progress("Estimating") as advance:
         lumi = relighter.estimate(picture.pixels, steps=steps, seed=seed, progress=watch.first_step(advance))
     watch.lap("estimate")
@@ -196,10 +199,17 @@ class Watch:
         return noted
 
 
-def _load(bundle: Path | None, device: str, ops: str) -> Relighter:
-    from dior_rt.relight import Relighter
+@contextmanager
+def _loading(bundle: Path | None, device: str, ops: str) -> Iterator[Callable[[], Relighter]]:
+    """Load the model while the block reads pictures; the function that it gets waits for the model."""
 
-    return Relighter(bundle, device, ops)
+    def load() -> Relighter:
+        from dior_rt.relight import Relighter
+
+        return Relighter(bundle, device, ops)
+
+    with ThreadPoolExecutor(1) as pool:
+        yield pool.submit(load).result
 
 
 def _settings(relighter: Relighter) -> dict[str, Any]:
