@@ -6,8 +6,36 @@ grid = ops.reduce_photo(photo, (64, 64))
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
+from dior_rt.kernels.devices import Device, list_devices, open_device, open_ops
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
+from dior_rt.kernels.selftest import self_test
 from dior_rt.kernels.types import KernelError, Stroke, Strokes
 
-__all__ = ["KernelError", "NumpyOps", "Ops", "Stroke", "Strokes"]
+if TYPE_CHECKING:
+    from dior_rt.kernels.opencl_ops import OpenCLOps as OpenCLOps
+
+__all__ = [
+    "Device",
+    "KernelError",
+    "NumpyOps",
+    "OpenCLOps",
+    "Ops",
+    "Stroke",
+    "Strokes",
+    "list_devices",
+    "open_device",
+    "open_ops",
+    "self_test",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # pyopencl is loaded only by those who ask for OpenCL.
+    if name == "OpenCLOps":
+        from dior_rt.kernels.opencl_ops import OpenCLOps
+
+        return OpenCLOps
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

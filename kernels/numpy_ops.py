@@ -7,9 +7,9 @@ import numpy as np
 from dior_rt.kernels import draw
 from dior_rt.kernels.color import ENCODED_KNEE, LINEAR_KNEE, decode_table, encode_table
 from dior_rt.kernels.ops import Grid, Ops
-from dior_rt.kernels.resample import area_weights, bands, taps
+from dior_rt.kernels.resample import area_weights, bands, spline_taps
 from dior_rt.kernels.sparsify import Discs, Lattice, spans
-from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, Light
+from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA, rough_reciprocal
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
 
@@ -58,11 +58,9 @@ class NumpyOps(Ops):
     def _draw_strokes(self, strokes: list[Stroke], size: Grid) -> Strokes:
         height, width = size
         light, mask = np.zeros((height, width, 3), np.float32), np.zeros(size, np.float32)
-        reach = draw.reach(strokes)
         for rows in bands(height, width):
-            for stroke, (first, last) in zip(strokes, reach, strict=True):
-                if first < rows.stop and last > rows.start:
-                    _lay_over(light[rows], mask[rows], stroke, rows.start)
+            for stroke in strokes:
+                _lay_over(light[rows], mask[rows], stroke, rows.start)
         np.divide(light, mask[..., None], out=light, where=mask[..., None] > 0)
         return Strokes(light, mask)
 
@@ -70,7 +68,7 @@ class NumpyOps(Ops):
         height, width = lumi.shape[:2]
         row = (np.arange(height) + lattice.oy) // lattice.cell
         column = (np.arange(width) + lattice.ox) // lattice.cell
-        pixels = np.bincount(row)[:, None, None] * np.bincount(column)[:, None].astype(np.float32)
+        pixels = np.float32(np.bincount(row)[:, None, None] * np.bincount(column)[:, None])
         first_rows, first_columns = (np.flatnonzero(np.diff(x, prepend=-1)) for x in (row, column))
         mean = np.add.reduceat(np.add.reduceat(lumi, first_rows, 0), first_columns, 1) / pixels
         mask = lattice.keep.astype(np.float32)
@@ -85,22 +83,24 @@ class NumpyOps(Ops):
         mask = (np.cumsum(edges[:, :width], 1) > 0).astype(np.float32)
         return Strokes(np.where(mask[..., None] > 0, lumi, np.float32(0)), mask)
 
-    def _transfer(self, photo: Picture, light: Light) -> Picture:
+    def _transfer(self, photo: Picture, nodes: FloatArray) -> Picture:
         height, width = photo.shape[:2]
-        result = np.empty_like(photo, order="C", subok=False)
-        upper_row, lower_row, down = taps(height, light.slope.shape[0])
-        left, right, across = taps(width, light.slope.shape[1])
-        down, across = down[:, None, None], across[:, None]
-        model = np.concatenate([light.slope, light.offset], 2)
+        result = np.empty(photo.shape, photo.dtype)
+        row, down = spline_taps(height, nodes.shape[0] - 2)
+        column, across = spline_taps(width, nodes.shape[1] - 2)
+        whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
         for rows in bands(height, width):
-            band = model[upper_row[rows]] * (1 - down[rows]) + model[lower_row[rows]] * down[rows]
-            slope, offset = np.split(band[:, left] * (1 - across) + band[:, right] * across, 2, axis=2)
-            scale = 1 if photo.dtype == np.float32 else np.float32(1 / np.iinfo(photo.dtype).max)
-            guide = (photo[rows] @ LIGHTNESS)[..., None] * scale
-            gain = np.expm1(np.clip(slope * guide + offset, light.low, light.high))
             linear = self._decode(photo[rows])
-            linear += (linear + np.float32(EPSILON)) * gain
-            result[rows] = self._encode(linear, photo.dtype)
+            lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1)
+            total = np.zeros((*lightness.shape, 4), np.float32)
+            for k, m in np.ndindex(3, 3):
+                near = nodes[row[rows, None] + k, column + m]
+                distance = (lightness - near[..., 3]) / np.float32(SIGMA)
+                weight = down[k, rows, None] * across[m] * rough_reciprocal(1 + distance * distance)
+                near[..., 3] = 1
+                total += weight[..., None] * near
+            gain = np.exp2(total[..., :3] / total[..., 3:]) - 1
+            result[rows] = self._encode(linear + (linear + np.float32(EPSILON)) * gain, photo.dtype)
         return result
 
 
@@ -115,24 +115,27 @@ def _weighted(light: Picture, mask: Picture) -> FloatArray:
 
 def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int) -> None:
     """Blend one stroke over a band that starts at row `top`; light holds value * mask."""
-    nearest = np.full(mask.shape, np.inf, np.float32)
-    margin = draw.radius(stroke) + 1
-    for segment in draw.segments(stroke):
-        window = _window(segment, margin, top, mask.shape)
-        y = np.arange(window[0].start, window[0].stop, dtype=np.float32)[:, None] + np.float32(top + 0.5)
-        x = np.arange(window[1].start, window[1].stop, dtype=np.float32) + np.float32(0.5)
-        if x.size and y.size:
-            np.minimum(nearest[window], draw.distance_squared(segment, x, y), out=nearest[window])
+    ends, margin = draw.segments(stroke), draw.radius(stroke) + 1
+    box = _window(ends.reshape(-1, 2), margin, top, mask.shape)
+    nearest = np.full(mask[box].shape, np.inf, np.float32)
+    if nearest.size == 0:
+        return
+    for segment in ends:
+        y, x = _window(segment.reshape(-1, 2), margin, top, mask.shape)
+        middle_y = np.arange(y.start, y.stop, dtype=np.float32)[:, None] + np.float32(top + 0.5)
+        middle_x = np.arange(x.start, x.stop, dtype=np.float32) + np.float32(0.5)
+        here = nearest[
+            y.start - box[0].start : y.stop - box[0].start, x.start - box[1].start : x.stop - box[1].start
+        ]
+        np.minimum(here, draw.distance_squared(segment, middle_x, middle_y), out=here)
     cover = draw.coverage(stroke, np.sqrt(nearest))
-    light *= (1 - cover)[..., None]
-    light += cover[..., None] * np.array(stroke.light, np.float32)
-    mask *= 1 - cover
-    mask += cover
+    light[box] += cover[..., None] * (np.array(stroke.light, np.float32) - light[box])
+    mask[box] += cover * (1 - mask[box])
 
 
-def _window(segment: FloatArray, margin: float, top: int, shape: tuple[int, int]) -> tuple[slice, slice]:
-    """The rows and columns of a band that come within `margin` of a segment."""
-    x, y = segment[0::2], segment[1::2] - top
-    rows = np.clip([np.floor(y.min() - margin), np.ceil(y.max() + margin)], 0, shape[0]).astype(int)
-    columns = np.clip([np.floor(x.min() - margin), np.ceil(x.max() + margin)], 0, shape[1]).astype(int)
-    return slice(*rows), slice(*columns)
+def _window(points: FloatArray, margin: float, top: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The rows and columns of a band that come within `margin` of the box of some points (x, y)."""
+    low = np.floor(points.min(0) - margin) - (0, top)
+    high = np.ceil(points.max(0) + margin) - (0, top)
+    (left, above), (right, below) = (np.clip(edge, 0, shape[::-1]).astype(int) for edge in (low, high))
+    return slice(above, below), slice(left, right)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dior_rt.kernels.sparsify import Discs, Lattice, draw_lattice, draw_walks
-from dior_rt.kernels.transfer import Light, fit
+from dior_rt.kernels.transfer import nodes
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
 Mode = Literal["strokes", "coarse", "dense"]
@@ -125,7 +125,7 @@ class Ops(ABC):
                 raise ValueError(f"the {name} grid must be finite and >= 0")
         if source.shape != relit.shape:
             raise ValueError(f"the grids differ: source {source.shape[:2]}, relit {relit.shape[:2]}")
-        return self._transfer(photo, fit(source, relit))
+        return self._transfer(photo, nodes(source, relit))
 
     @abstractmethod
     def _decode(self, picture: Picture) -> FloatArray: ...
@@ -149,7 +149,7 @@ class Ops(ABC):
     def _cut(self, lumi: FloatArray, discs: Discs) -> Strokes: ...
 
     @abstractmethod
-    def _transfer(self, photo: Picture, light: Light) -> Picture: ...
+    def _transfer(self, photo: Picture, nodes: FloatArray) -> Picture: ...
 
 
 def _check_dtype(name: str, array: np.ndarray) -> None:

@@ -31,10 +31,12 @@ def area_weights(pixels: int, cells: int) -> FloatArray:
     return (np.maximum(overlap, 0) / pixels).astype(np.float32)
 
 
-def taps(pixels: int, cells: int) -> tuple[np.ndarray, np.ndarray, FloatArray]:
-    """Where pixels lie between the centres of cells: (lower cell, upper cell, weight of the upper)."""
-    at = (np.arange(pixels) + 0.5) * (cells / pixels) - 0.5
-    at = np.clip(at, 0, cells - 1)
-    lower = np.minimum(at.astype(np.int64), max(cells - 2, 0))
-    upper = np.minimum(lower + 1, cells - 1)
-    return lower, upper, (at - lower).astype(np.float32)
+def spline_taps(pixels: int, cells: int) -> tuple[np.ndarray, FloatArray]:
+    """The cell each pixel's centre lies in, and the quadratic B-spline's weights of the one before, it, the one after.
+
+    (pixels,) integers and (3, pixels) float32.
+    """
+    centre = (2 * np.arange(pixels, dtype=np.int64) + 1) * cells
+    cell = centre // (2 * pixels)
+    d = ((centre - (2 * cell + 1) * pixels) / (2 * pixels)).astype(np.float32)
+    return cell, np.stack([0.5 * (0.5 - d) ** 2, 0.75 - d * d, 0.5 * (0.5 + d) ** 2])

@@ -1,22 +1,21 @@
-"""Quotient light: carrying the light of a small grid over to the full-size photo without leaking across
-edges.
+"""Quotient light: carrying the light of a small grid over to the full-size photo without leaking across edges.
 
     photo' = (photo + e) * R - e = photo + (photo + e) * (R - 1),     e = 0.02, linear light
 
-On the grid, log R = log((relit + e) / (source + e)). Between the grid's cells it is not interpolated
-blindly: in every 3 x 3 window it is fitted by a line in the photo's lightness g (the guided filter of He,
-Sun, Tang, 2010),
+On the grid log2 R = log2((relit + e) / (source + e)). At a pixel it is the weighted mean of the 3 x 3 cells around
+the one it lies in (joint bilateral upsampling; Kopf, Cohen, Lischinski, Uyttendaele, 2007):
 
-    log R ~ a * g + b,     a = cov(g, log R) / (var(g) + LAMBDA),  b = mean(log R) - a * mean(g)
+    w_k = B(dx) * B(dy) * 1 / (1 + (g - g_k)^2 / SIGMA^2)
 
-and a, b, averaged over the windows that hold a cell and interpolated bilinearly, are applied to the
-lightness of each full-size pixel. log R stays between the smallest and the largest value of the grid, by
-channel.
+B is the quadratic B-spline, which is smooth across cells; g is the pixel's lightness and g_k the cell's. The
+reciprocal is taken within 12 % by exponent arithmetic, the same on every device: a weight only needs its shape.
+
+A cell's value is a mean, so a smooth interpolation of the values would be flatter than the light was. Before it,
+log2 R is sharpened by what the spline will blur, and kept between the least and greatest of its 3 x 3 neighbours: no
+halo can come of it. R therefore never leaves the range of the grid's own quotients.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,45 +23,37 @@ from dior_rt.kernels.color import linear_to_srgb
 from dior_rt.kernels.types import FloatArray
 
 EPSILON = 0.02
-LAMBDA = 0.01
-#: The lightness g of a pixel: the weighted mean of its sRGB-encoded channels.
+SIGMA = 0.04
+#: The lightness g of a pixel: this mean of its sRGB-encoded channels, clipped to 0..1.
 LIGHTNESS = np.array([0.25, 0.5, 0.25], np.float32)
 
 
-@dataclass(frozen=True)
-class Light:
-    """log R = slope * g + offset by cell, (h, w, 3) each, clipped to low..high, (3,) each; all float32."""
-
-    slope: FloatArray
-    offset: FloatArray
-    low: FloatArray
-    high: FloatArray
-
-
-def fit(source: FloatArray, relit: FloatArray) -> Light:
-    """The light that turns the grid `source` into `relit`; both (h, w, 3) linear >= 0."""
-    guide = (linear_to_srgb(source) @ LIGHTNESS.astype(np.float64))[..., None]
-    log_r = np.log((relit.astype(np.float64) + EPSILON) / (source.astype(np.float64) + EPSILON))
-    mean_g, mean_r = _window_mean(guide), _window_mean(log_r)
-    variance = _window_mean(guide * guide) - mean_g * mean_g
-    slope = (_window_mean(guide * log_r) - mean_g * mean_r) / (np.maximum(variance, 0) + LAMBDA)
-    offset = mean_r - slope * mean_g
-    return Light(
-        _window_mean(slope).astype(np.float32),
-        _window_mean(offset).astype(np.float32),
-        log_r.min((0, 1)).astype(np.float32),
-        log_r.max((0, 1)).astype(np.float32),
-    )
+def nodes(source: FloatArray, relit: FloatArray) -> FloatArray:
+    """(h, w, 3) linear grids -> (h + 2, w + 2, 4) float32: log2 R and g of each cell, the border repeated."""
+    quotient = (relit.astype(np.float64) + EPSILON) / (source.astype(np.float64) + EPSILON)
+    log_r = _sharpen(np.log2(quotient))
+    lightness = np.clip(linear_to_srgb(source) @ LIGHTNESS, 0, 1)
+    cells = np.concatenate([log_r, lightness[..., None]], 2)
+    return np.pad(cells, ((1, 1), (1, 1), (0, 0)), mode="edge").astype(np.float32)
 
 
-def _window_mean(x: np.ndarray) -> np.ndarray:
-    """Mean over the 3 x 3 neighbours that exist; (h, w, c) -> (h, w, c)."""
+def rough_reciprocal(q: FloatArray) -> FloatArray:
+    """1 / q within 12 % for 1 <= q < 2**60, continuous and falling: its exponent and mantissa bits, negated."""
+    return (np.int32(0x7EF311C7) - q.view(np.int32)).view(np.float32)
+
+
+def _sharpen(x: np.ndarray) -> np.ndarray:
+    """x + (x - the spline's mean over each cell), within the range of the 3 x 3 neighbours; (h, w, 3)."""
+    blurred, low, high = x, x, x
     for axis in (0, 1):
-        padded = np.pad(x, [(1, 1) if i == axis else (0, 0) for i in range(3)])
-        n = x.shape[axis]
-        first, middle, last = (np.take(padded, range(k, k + n), axis) for k in range(3))
-        neighbours = np.full(n, 3.0)
-        neighbours[0] -= 1
-        neighbours[-1] -= 1
-        x = (first + middle + last) / neighbours.reshape([-1 if i == axis else 1 for i in range(3)])
-    return x
+        before, here, after = _neighbours(blurred, axis)
+        blurred = (before + 4 * here + after) / 6
+        low = np.minimum.reduce(_neighbours(low, axis))
+        high = np.maximum.reduce(_neighbours(high, axis))
+    return np.clip(2 * x - blurred, low, high)
+
+
+def _neighbours(x: np.ndarray, axis: int) -> list[np.ndarray]:
+    """Of every cell the one before, itself and the one after along an axis; the border is repeated."""
+    padded = np.pad(x, [(1, 1) if i == axis else (0, 0) for i in range(3)], mode="edge")
+    return [np.take(padded, range(k, k + x.shape[axis]), axis) for k in range(3)]

@@ -1,0 +1,116 @@
+"""What OpenCL devices there are, and the choice among them. pyopencl is imported only here and in opencl_ops.py."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from dior_rt.kernels.numpy_ops import NumpyOps
+from dior_rt.kernels.ops import Ops
+from dior_rt.kernels.selftest import self_test
+from dior_rt.kernels.types import KernelError
+
+
+@dataclass(frozen=True)
+class Device:
+    """An OpenCL device. index: its number in `list_devices()`; type: "gpu", "cpu", "accelerator" or "other"."""
+
+    index: int
+    name: str
+    platform: str
+    type: str
+    handle: Any
+
+
+def list_devices() -> list[Device]:
+    """Every OpenCL device of every platform, in the platforms' order. Raises KernelError where there is no OpenCL."""
+    try:
+        import pyopencl as cl
+    except ImportError as error:
+        raise KernelError(f"pyopencl cannot be loaded ({error}).") from error
+    try:
+        handles = [device for platform in cl.get_platforms() for device in _devices(platform)]
+    except cl.Error as error:
+        raise KernelError(f"no OpenCL platform was found ({error}).") from error
+    types = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu", cl.device_type.ACCELERATOR: "accelerator"}
+    return [
+        Device(
+            index,
+            handle.name.strip(),
+            handle.platform.name.strip(),
+            next((word for bit, word in types.items() if handle.type & bit), "other"),
+            handle,
+        )
+        for index, handle in enumerate(handles)
+    ]
+
+
+def open_ops(name: str = "auto") -> Ops:
+    """The Ops of that name, self-tested; `reason` says why it was chosen.
+
+    "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose name
+    contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that fails gives
+    way to the next, and the reason says so. Raises KernelError, one sentence, where what was named cannot be had.
+    """
+    if name == "numpy":
+        return NumpyOps()
+    if name == "auto":
+        return _choose_best()
+    backend, _, which = name.partition(":")
+    if backend != "opencl":
+        raise KernelError(f"there are no pixel kernels called {name!r}: use auto, numpy or opencl[:<which>].")
+    devices = by_preference(list_devices())
+    if which:
+        devices = [device for device in devices if _answers_to(device, which)]
+    if not devices:
+        raise KernelError(f"no OpenCL device answers to {name!r}.")
+    return open_device(devices[0])
+
+
+def open_device(device: Device) -> Ops:
+    """The Ops of one OpenCL device, self-tested. Raises KernelError if it cannot be opened or computes wrongly."""
+    from dior_rt.kernels.opencl_ops import OpenCLOps
+
+    ops = OpenCLOps(device)
+    self_test(ops)
+    return ops
+
+
+def by_preference(devices: list[Device]) -> list[Device]:
+    """GPUs first, then CPUs, then the rest; otherwise in the platforms' order."""
+    order = {"gpu": 0, "cpu": 1}
+    return sorted(devices, key=lambda device: order.get(device.type, 2))
+
+
+def _choose_best() -> Ops:
+    failures = []
+    try:
+        for device in by_preference(list_devices()):
+            try:
+                ops = open_device(device)
+            except KernelError as error:
+                failures.append(str(error))
+                continue
+            ops.reason = " ".join(
+                [*failures, f"it is the first OpenCL {device.type} that passes its self-test"]
+            )
+            return ops
+    except KernelError as error:
+        failures.append(str(error))
+    ops = NumpyOps()
+    ops.reason = " ".join([*failures, "no OpenCL device is usable, so the pixel kernels run on NumPy"])
+    return ops
+
+
+def _devices(platform: Any) -> list[Any]:
+    """A platform's devices; one that has none says so with an error."""
+    import pyopencl as cl
+
+    try:
+        return list(platform.get_devices())
+    except cl.Error:
+        return []
+
+
+def _answers_to(device: Device, which: str) -> bool:
+    return device.index == int(which) if which.isdecimal() else which.lower() in device.name.lower()

@@ -1,0 +1,90 @@
+"""An opened OpenCL device: its programs, its buffers, and how a kernel is launched. Knows nothing of pictures."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyopencl as cl
+
+from dior_rt.kernels.types import KernelError
+
+if TYPE_CHECKING:
+    from dior_rt.kernels.devices import Device
+
+SOURCES = Path(__file__).parent
+
+
+class Session:
+    """Safe to use from several threads: kernels are objects of one call, and what is cached is behind a lock.
+
+    Where the device shares the host's memory, buffers are the arrays themselves and nothing is copied.
+    """
+
+    def __init__(self, device: Device) -> None:
+        """Open the device. Programs are built when first needed. Raises KernelError if it cannot be opened."""
+        self.name = f"opencl:{device.index} ({device.name})"
+        try:
+            self._context = cl.Context([device.handle])
+            self._queue = cl.CommandQueue(self._context)
+            self._shares_memory = bool(device.handle.host_unified_memory)
+        except cl.Error as error:
+            raise KernelError(f"{self.name} cannot be opened ({error}).") from error
+        self._lock = threading.Lock()
+        self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
+        self._constants: dict[int, tuple[np.ndarray, cl.Buffer]] = {}
+
+    def kernel(self, name: str, sources: str, **defines: object) -> cl.Kernel:
+        """The kernel of that name, from the .cl files `sources` (parted by blanks), built with -D key=value."""
+        options = tuple(f"-D{key}={value}" for key, value in defines.items())
+        with self._lock:
+            program = self._programs.get((sources, options))
+            if program is None:
+                text = "\n".join((SOURCES / f"{source}.cl").read_text("utf-8") for source in sources.split())
+                program = cl.Program(self._context, text).build(["-cl-std=CL1.2", *options])
+                self._programs[sources, options] = program
+        return cl.Kernel(program, name)
+
+    def launch(self, kernel: cl.Kernel, items: tuple[int, ...], *args: cl.Buffer | float | None) -> None:
+        """Run the kernel over `items` and wait, so that a buffer need not outlive the call. None is a null pointer.
+
+        Integers are passed as int, floats as float.
+        """
+        scalars = {int: np.int32, float: np.float32}
+        kernel(self._queue, items, None, *(scalars.get(type(arg), lambda x: x)(arg) for arg in args)).wait()
+
+    def constant(self, array: np.ndarray) -> cl.Buffer:
+        """A copy of an array that lives as long as the session, once for each array."""
+        with self._lock:
+            if id(array) not in self._constants:
+                flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
+                self._constants[id(array)] = array, cl.Buffer(self._context, flags, hostbuf=array)
+            return self._constants[id(array)][1]
+
+    def scratch(self, size: int) -> cl.Buffer:
+        """An uninitialised buffer of `size` bytes on the device."""
+        return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
+
+    def input(self, array: np.ndarray) -> cl.Buffer:
+        """The array as the device sees it; the array itself if it is contiguous and the memory is shared."""
+        share = cl.mem_flags.USE_HOST_PTR if self._shares_memory else cl.mem_flags.COPY_HOST_PTR
+        return cl.Buffer(self._context, cl.mem_flags.READ_ONLY | share, hostbuf=np.ascontiguousarray(array))
+
+    @contextmanager
+    def output(self, array: np.ndarray) -> Iterator[cl.Buffer]:
+        """A buffer for kernels to write all of; when the block ends, the contiguous array holds what they wrote."""
+        if not self._shares_memory:
+            buffer = self.scratch(array.nbytes)
+            yield buffer
+            cl.enqueue_copy(self._queue, array, buffer)
+            return
+        buffer = cl.Buffer(self._context, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, hostbuf=array)
+        yield buffer
+        mapped, _ = cl.enqueue_map_buffer(
+            self._queue, buffer, cl.map_flags.READ, 0, array.shape, array.dtype, strides=array.strides
+        )
+        mapped.base.release(self._queue)
