@@ -1,0 +1,129 @@
+"""Training: it learns, it goes on where it stopped, and a LoRA merged is the LoRA trained."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from peft import PeftModel
+from safetensors.torch import load_file
+
+from dior_rt.errors import InputError
+from dior_rt.export.lora import merge_lora
+from dior_rt.training.fit import LORA, STATE, WEIGHTS, Plan, draw_sigma, fit, fit_lora, flow_loss
+from dior_rt.training.network import Config, Mini, load_network
+from dior_rt.training.triplets import Batches
+
+TINY = Config(width=32, depth=1, heads=2, patch=8, features=8)
+SHORT = Plan(steps=6, batch=2, rate=2e-3, warmup=2, average=2, save_every=2)
+
+
+def loss_of(network: torch.nn.Module, views) -> float:
+    """The loss on batches that training never sees, all from pure noise."""
+    batch = next(iter(Batches(views, 24, seed=99)))
+    noise = torch.randn(batch["x0"].shape, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        return float(flow_loss(network, batch, torch.ones(24), noise))
+
+
+@pytest.fixture(scope="module")
+def trained(renders, tmp_path_factory) -> Path:
+    """The folder of a short run."""
+    out = tmp_path_factory.mktemp("run")
+    fit(renders, out, TINY, Plan(steps=60, batch=6, rate=4e-3, warmup=5, average=5))
+    return out
+
+
+def test_the_loss_goes_down(trained, views) -> None:
+    torch.manual_seed(0)
+    before, after = loss_of(Mini(TINY), views), loss_of(load_network(trained / WEIGHTS), views)
+    assert after < 0.9 * before
+
+
+def test_a_stopped_run_goes_on_as_if_it_had_not(renders, tmp_path) -> None:
+    through, stopped = tmp_path / "through", tmp_path / "stopped"
+    fit(renders, through, TINY, SHORT)
+
+    def stop(step: int, loss: float) -> None:
+        if step == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(renders, stopped, TINY, SHORT, stop)
+    seen = []
+    fit(renders, stopped, TINY, SHORT, lambda step, loss: seen.append(step))
+    assert seen == [5, 6]  # from the state of step 4
+    for name in (WEIGHTS, STATE):
+        whole, resumed = load_file(through / name), load_file(stopped / name)
+        assert whole.keys() == resumed.keys()
+        for key, tensor in whole.items():
+            torch.testing.assert_close(resumed[key], tensor, rtol=1e-5, atol=1e-7)
+    assert sorted(path.name for path in stopped.iterdir()) == sorted([WEIGHTS, STATE])
+
+
+def test_a_finished_run_has_nothing_left_to_do(renders, trained) -> None:
+    before = (trained / WEIGHTS).read_bytes()
+    seen = []
+    fit(renders, trained, TINY, Plan(steps=60, batch=6), lambda step, loss: seen.append(step))
+    assert seen == [] and (trained / WEIGHTS).read_bytes() == before
+
+
+def test_what_is_saved_is_the_average_of_the_weights(renders, tmp_path) -> None:
+    fit(renders, tmp_path, TINY, SHORT)
+    state, network = load_file(tmp_path / STATE), load_network(tmp_path / WEIGHTS)
+    for k, weight in enumerate(network.parameters()):
+        assert torch.equal(weight, state[f"{k}.average"])
+    assert any(not torch.equal(weight, state[f"{k}.weight"]) for k, weight in enumerate(network.parameters()))
+
+
+def test_a_run_of_another_network_is_not_taken_up(renders, trained) -> None:
+    with pytest.raises(InputError, match="cannot go on: the network that it trained has another size"):
+        fit(renders, trained, replace(TINY, width=64), Plan(steps=61, batch=2))
+
+
+def test_a_damaged_state_is_not_taken_up(renders, tmp_path) -> None:
+    (tmp_path / STATE).write_bytes(b"no state")
+    with pytest.raises(InputError, match="cannot go on"):
+        fit(renders, tmp_path, TINY, SHORT)
+
+
+def test_bfloat16_trains_and_saves_single_precision(renders, tmp_path) -> None:
+    losses = []
+    fit(renders, tmp_path, TINY, replace(SHORT, precision="bf16"), lambda step, loss: losses.append(loss))
+    assert len(losses) == SHORT.steps and all(0 < loss < 10 for loss in losses)
+    assert all(weight.dtype == torch.float32 for weight in load_file(tmp_path / WEIGHTS).values())
+
+
+@torch.no_grad()
+def test_a_merged_lora_is_the_lora(renders, trained, views, tmp_path) -> None:
+    fit_lora(trained / WEIGHTS, renders, tmp_path, 2, replace(SHORT, rate=2e-2))
+    base = load_network(tmp_path / WEIGHTS)
+    for weight, other in zip(base.parameters(), load_network(trained / WEIGHTS).parameters(), strict=True):
+        assert torch.equal(weight, other)
+    adapted = PeftModel.from_pretrained(load_network(tmp_path / WEIGHTS), str(tmp_path / LORA)).eval()
+    merged = merge_lora(load_network(tmp_path / WEIGHTS), tmp_path / LORA)
+    batch = next(iter(Batches(views, 4, seed=1)))
+    given = {name: batch[name] for name in ("photo", "light", "mask", "mode")}
+    given |= {"x": torch.zeros_like(batch["x0"]), "sigma": torch.ones(4)}
+    plain, unmerged, after = (network(**given) for network in (base, adapted, merged))
+    torch.testing.assert_close(after, unmerged, rtol=0, atol=1e-5)
+    assert (after - plain).abs().max() > 1e-4
+
+
+def test_the_rate_warms_up_stays_and_falls_to_nothing() -> None:
+    plan = Plan(steps=1000, rate=1.0, warmup=100)
+    rates = [plan.rate_at(step) for step in range(1001)]
+    assert rates[0] == pytest.approx(0.01) and rates[1000] == 0
+    assert rates[:100] == sorted(rates[:100]) and rates[99:801] == [1.0] * 702
+    assert rates[800:] == sorted(rates[800:], reverse=True)
+    longer = Plan(steps=2000, rate=1.0, warmup=100)
+    assert [longer.rate_at(step) for step in range(801)] == rates[:801]
+
+
+def test_flow_times_are_one_or_shifted_towards_it() -> None:
+    generator = torch.Generator().manual_seed(0)
+    sigma = draw_sigma(20_000, Plan(steps=1, shift=8.0, always_noise=0.5), generator)
+    below = sigma[sigma < 1]
+    assert sigma.min() >= 0.02 and sigma.max() == 1
+    assert len(below) / len(sigma) == pytest.approx(0.5, abs=0.02)
+    assert float(below.median()) == pytest.approx(8 * 0.5 / (1 + 7 * 0.5), abs=0.01)

@@ -1,0 +1,205 @@
+"""Mini's network: what it answers before it has learnt, what its output depends on, and its files."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from dior_rt.errors import InputError
+from dior_rt.family import mini
+from dior_rt.kernels import NumpyOps
+from dior_rt.training import network as module
+from dior_rt.training.network import (
+    Config,
+    Mini,
+    decode_light,
+    encode_light,
+    linear_to_srgb,
+    load_network,
+    rotate,
+    rotations,
+    save_network,
+    srgb_to_linear,
+)
+
+SMALL = Config(width=32, depth=1, heads=2, patch=4, features=4)
+
+
+def inputs(rows: int = 8, columns: int = 12, batch: int = 3, seed: int = 0) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(channels: int) -> torch.Tensor:
+        return torch.rand(batch, channels, rows, columns, generator=generator)
+
+    return {
+        "x": torch.randn(batch, 3, rows, columns, generator=generator),
+        "sigma": torch.tensor([1.0, 0.5, 0.01])[:batch],
+        "photo": uniform(3),
+        "light": 4 * uniform(3),
+        "mask": uniform(1).round(),
+        "mode": torch.zeros(batch, dtype=torch.int64),
+    }
+
+
+@pytest.fixture
+def awake() -> Mini:
+    """A small network all of whose weights take part."""
+    torch.manual_seed(0)
+    network = Mini(SMALL)
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.normal_(std=0.2)
+    return network.eval()
+
+
+def test_untrained_it_returns_the_photo_and_takes_the_photo_for_light() -> None:
+    network, given = Mini(SMALL), inputs()
+    with torch.no_grad():
+        np.testing.assert_allclose(network.predict(**given), 0, atol=1e-5)
+        given["mode"] += 1
+        expected = 2 * encode_light(srgb_to_linear(given["photo"])) - 1
+        torch.testing.assert_close(network.predict(**given), expected)
+
+
+@torch.no_grad()
+def test_velocity_and_x0_are_one_answer(awake) -> None:
+    given = inputs()
+    s = given["sigma"][:, None, None, None]
+    x0 = given["x"] - s * awake(**given)
+    torch.testing.assert_close(x0, awake.predict(**given), atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("size", [(4, 4), (4, 40), (12, 8), (32, 32)])
+def test_any_grid_of_whole_patches_will_do(awake, size) -> None:
+    velocity = awake(**inputs(*size))
+    assert velocity.shape == (3, 3, *size) and velocity.isfinite().all()
+
+
+@torch.no_grad()
+def test_pictures_of_a_batch_do_not_mix(awake) -> None:
+    given = inputs()
+    given["mode"][1] = 1
+    together = awake(**given)
+    for k in range(3):
+        alone = awake(**{name: value[k : k + 1] for name, value in given.items()})
+        torch.testing.assert_close(together[k : k + 1], alone, atol=1e-4, rtol=1e-4)
+
+
+@torch.no_grad()
+def test_every_input_matters_but_light_that_is_not_specified(awake) -> None:
+    given = inputs()
+    base = awake.predict(**given)
+    for name, other in inputs(seed=1).items():
+        if name in ("sigma", "mode"):
+            other = 1 - given[name]
+        changed = awake.predict(**{**given, name: other})
+        assert (changed - base).abs().max() > 1e-3, name
+    hidden = given["light"] + 5 * (1 - given["mask"])
+    assert torch.equal(awake.predict(**{**given, "light": hidden}), base)
+
+
+@torch.no_grad()
+def test_every_cell_sees_the_whole_grid(awake) -> None:
+    given = inputs(16, 16, 1)
+    moved = {**given, "photo": given["photo"].clone()}
+    moved["photo"][..., :4, :4] = 0
+    far = (awake.predict(**moved) - awake.predict(**given))[..., 12:, 12:]
+    assert far.abs().max() > 1e-5
+
+
+def test_positions_enter_attention_by_their_distance_alone() -> None:
+    rows, columns, size = 6, 7, 16
+    turns = rotations(rows, columns, size, torch.device("cpu"))
+    q, k = torch.randn(2, 1, 1, 1, size, generator=torch.Generator().manual_seed(0))
+    at = [
+        rotate(part.expand(1, 1, rows * columns, size), turns)[0, 0].unflatten(0, (rows, columns))
+        for part in (q, k)
+    ]
+    pairs = [((0, 0), (2, 3)), ((3, 2), (5, 5)), ((1, 3), (3, 6))]
+    products = [float(at[0][one] @ at[1][other]) for one, other in pairs]
+    assert products == pytest.approx([products[0]] * 3, abs=1e-4)
+    assert float(at[0][0, 0] @ at[1][3, 2]) != pytest.approx(products[0], abs=1e-3)
+
+
+def test_relit_light_stays_physical(awake) -> None:
+    given = inputs()
+    with torch.no_grad():
+        awake.head.bias.fill_(50.0)
+        bright = given["photo"] + awake.predict(**given) / 4
+        awake.head.bias.fill_(-50.0)
+        dark = given["photo"] + awake.predict(**given) / 4
+    assert bright.clamp(0, 1).min() > 0.99 and dark.clamp(0, 1).max() < 0.01
+    black = torch.zeros(1, 3, 4, 4)
+    assert (module._relight(black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
+
+
+def test_colour_is_the_kernels_colour() -> None:
+    linear = np.linspace(0, 1, 4097, dtype=np.float32)
+    ops = NumpyOps()
+    np.testing.assert_allclose(
+        linear_to_srgb(torch.from_numpy(linear)), ops.encode_srgb(linear, np.float32), atol=2e-6
+    )
+    np.testing.assert_allclose(srgb_to_linear(torch.from_numpy(linear)), ops.decode_srgb(linear), atol=2e-6)
+
+
+def test_light_s_code_is_the_runtime_s() -> None:
+    light = torch.logspace(-4, 3, 200)
+    torch.testing.assert_close(decode_light(encode_light(light)), light, rtol=1e-4, atol=1e-6)
+    assert encode_light(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0, 1])
+    assert (module.RELIT_SCALE, module.LUMI_SCALE) == (mini.RELIT_SCALE, mini.LUMI_SCALE)
+
+
+def test_gradients_reach_every_weight_whatever_the_colour(awake) -> None:
+    given = inputs()
+    given["photo"][0], given["photo"][1] = 0, 1
+    given["mode"][2] = 1
+    awake(**given).square().mean().backward()
+    for name, weight in awake.named_parameters():
+        assert weight.grad is not None and weight.grad.isfinite().all() and weight.grad.any(), name
+
+
+@torch.no_grad()
+def test_a_network_survives_the_disk(awake, tmp_path) -> None:
+    path = tmp_path / "model.safetensors"
+    save_network(awake, path)
+    back = load_network(path)
+    assert back.config == SMALL and not back.training and [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert torch.equal(back(**inputs()), awake(**inputs()))
+
+
+@torch.no_grad()
+def test_half_precision_is_read_as_single(awake, tmp_path) -> None:
+    path, half = tmp_path / "model.safetensors", tmp_path / "half.safetensors"
+    save_network(awake, path)
+    from safetensors import safe_open
+
+    with safe_open(path, "pt") as file:
+        header = file.metadata()
+    save_file({name: weight.half() for name, weight in load_file(path).items()}, half, header)
+    back = load_network(half)
+    for (name, weight), other in zip(awake.named_parameters(), back.parameters(), strict=True):
+        assert other.dtype == torch.float32 and torch.equal(other, weight.half().float()), name
+
+
+def test_what_is_no_network_is_refused_in_a_sentence(awake, tmp_path) -> None:
+    path = tmp_path / "model.safetensors"
+    save_network(awake, path)
+    whole, weights = path.read_bytes(), load_file(path)
+    cases = {"cut": whole[: len(whole) // 2], "text": b"no network", "empty": b""}
+    for name, content in cases.items():
+        (tmp_path / name).write_bytes(content)
+    save_file(weights, tmp_path / "bare")
+    save_file(weights, tmp_path / "odd", {"config": '{"width": 32, "colour": 3}'})
+    save_file(weights, tmp_path / "wider", {"config": '{"width": 64, "depth": 1, "heads": 2}'})
+    for name in (*cases, "bare", "odd", "wider"):
+        with pytest.raises(InputError, match="is no checkpoint of mini") as refusal:
+            load_network(tmp_path / name)
+        assert "\n" not in str(refusal.value)
+    with pytest.raises(InputError, match="no such file"):
+        load_network(tmp_path / "missing")
+
+
+def test_a_width_that_the_heads_do_not_divide_is_refused() -> None:
+    with pytest.raises(InputError, match="multiple of 4 times the heads"):
+        Config(width=100, heads=8)

@@ -1,0 +1,216 @@
+"""Triplets: sums of single sources in linear light, honest strokes, and batches that repeat."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dior_rt.family import mini
+from dior_rt.kernels import NumpyOps, Strokes
+from dior_rt.training.network import decode_light, linear_to_srgb
+from dior_rt.training.triplets import (
+    GRIDS,
+    KINDS,
+    Batches,
+    Mix,
+    Pair,
+    draw,
+    example,
+    mix,
+    pair,
+    random_lights,
+    tint,
+    zoomed,
+)
+
+
+def pairs(views, kind: str, count: int = 12) -> list[tuple]:
+    """(view, pair) of one kind, on views in single precision."""
+    chosen = [views[k % len(views)] for k in range(count)]
+    fine = [replace(v, images=v.images.astype(np.float32), lumi=v.lumi.astype(np.float32)) for v in chosen]
+    return [(view, pair(np.random.default_rng(k), view, kind)) for k, view in enumerate(fine)]
+
+
+def lights_of(view, lumi: np.ndarray) -> np.ndarray:
+    """(sources, 3) the lights that make a Lumi map, found by least squares; asserts that they do."""
+    found = np.empty((len(view.lumi), 3))
+    for c in range(3):
+        columns = view.lumi[..., c].reshape(len(view.lumi), -1).T.astype(np.float64)
+        found[:, c] = np.linalg.lstsq(columns, lumi[..., c].ravel().astype(np.float64), rcond=None)[0]
+        np.testing.assert_allclose(
+            columns @ found[:, c], lumi[..., c].ravel(), atol=1e-3 * max(1, lumi.max())
+        )
+    return found
+
+
+def test_a_mix_is_linear_in_its_lights(views) -> None:
+    rng = np.random.default_rng(0)
+    one, other = rng.uniform(0, 2, (2, 5, 3)).astype(np.float32)
+    both = mix(views[0], 3 * one + other)
+    for whole, a, b in zip(both, mix(views[0], one), mix(views[0], other), strict=True):
+        np.testing.assert_allclose(whole, 3 * a + b, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pairs_are_float32_pictures_on_display(views, kind: str) -> None:
+    for _, sample in pairs(views, kind):
+        rasters = sample.photo, sample.relit, sample.source, sample.target
+        assert sample.kind == kind
+        assert all(raster.dtype == np.float32 and raster.shape == (24, 24, 3) for raster in rasters)
+        assert all(raster.min() >= 0 and np.isfinite(raster).all() for raster in rasters)
+        assert sample.photo.max() <= 1 and sample.relit.max() <= 1 and sample.photo.max() > 0.2
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_pictures_and_their_maps_come_of_the_same_lights_and_exposure(views, kind: str) -> None:
+    for view, sample in pairs(views, kind, 6):
+        for picture, lumi in ((sample.photo, sample.source), (sample.relit, sample.target)):
+            image = np.einsum("khwc,kc->hwc", view.images, lights_of(view, lumi))
+            np.testing.assert_allclose(picture, np.clip(image, 0, 1), atol=5e-3)
+
+
+def test_keep_keeps_everything(views) -> None:
+    for _, sample in pairs(views, "keep"):
+        assert np.array_equal(sample.photo, sample.relit) and np.array_equal(sample.source, sample.target)
+
+
+def test_change_changes_one_light_under_the_shared_exposure(views) -> None:
+    for view, sample in pairs(views, "change"):
+        before, after = lights_of(view, sample.source), lights_of(view, sample.target)
+        scale = max(before.max(), after.max())
+        changed = (np.abs(after - before) > 2e-3 * scale).any(axis=1)
+        assert changed.sum() == 1
+        assert (after.max(axis=1) > 1e-3 * scale).any(), "the last light went out"
+
+
+def test_replace_changes_more_than_one_light_most_of_the_time(views) -> None:
+    counts = []
+    for view, sample in pairs(views, "replace"):
+        before, after = lights_of(view, sample.source), lights_of(view, sample.target)
+        counts.append((np.abs(after - before) > 2e-3 * max(before.max(), after.max())).any(axis=1).sum())
+    assert np.mean(np.array(counts) >= 2) > 0.5
+
+
+def test_dim_sources_are_never_lit() -> None:
+    usable = np.array([True, False, False, True, False])
+    for seed in range(50):
+        lights = random_lights(np.random.default_rng(seed), usable)
+        assert lights[usable].any() and not lights[~usable].any()
+
+
+def test_tints_are_colours_of_about_unit_luminance() -> None:
+    rng = np.random.default_rng(0)
+    tints = np.stack([tint(rng) for _ in range(500)])
+    assert (tints >= 0).all() and 0.8 < tints.mean() < 1.2 and tints.std(axis=1).max() > 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_strokes_say_what_light_is_there(views, kind: str) -> None:
+    masks = []
+    for k, (_, sample) in enumerate(pairs(views, kind)):
+        light, mask = draw(np.random.default_rng(k), NumpyOps(), sample)
+        inside = mask > 0
+        assert light.dtype == mask.dtype == np.float32 and set(np.unique(mask)) <= {0, 1} and inside.any()
+        assert not light[~inside].any()
+        # A stroke's own values, a cell's mean, or one colour for all: each keeps the light's mean.
+        np.testing.assert_allclose(
+            light[inside].mean(axis=0), sample.target[inside].mean(axis=0), rtol=1e-3, atol=1e-5
+        )
+        assert (light <= sample.target.max(axis=(0, 1)) * 1.001).all()
+        masks.append(inside.mean())
+    assert min(masks) < 0.5
+
+
+def test_strokes_of_a_change_seek_the_change() -> None:
+    source = np.full((64, 64, 3), 0.5, np.float32)
+    target = source.copy()
+    target[:, 40:] = 2.0
+    share = [
+        (draw(np.random.default_rng(k), NumpyOps(), Pair("change", source, source, source, target))[1])
+        for k in range(30)
+    ]
+    right = np.mean([mask[:, 40:].mean() for mask in share])
+    left = np.mean([mask[:, :24].mean() for mask in share])
+    assert right > 1.5 * left
+
+
+def test_a_part_of_a_view_keeps_its_light(views) -> None:
+    view = views[0]
+    whole = zoomed(view, slice(0, 24), slice(0, 24), False, (8, 8))
+    mean = view.lumi.astype(np.float32).mean(axis=(1, 2))
+    np.testing.assert_allclose(whole.lumi.mean(axis=(1, 2)), mean, rtol=0.1)
+    flat = replace(view, images=np.full_like(view.images, 0.3), lumi=np.full_like(view.lumi, 0.7))
+    part = zoomed(flat, slice(3, 19), slice(5, 23), True, (12, 16))
+    assert part.images.shape == part.lumi.shape == (5, 12, 16, 3) and part.lumi.dtype == np.float32
+    np.testing.assert_allclose(part.images, 0.3, rtol=1e-3)
+    np.testing.assert_allclose(part.lumi, 0.7, rtol=1e-3)
+    mirrored = zoomed(view, slice(0, 24), slice(0, 24), True, (8, 8))
+    np.testing.assert_array_equal(mirrored.lumi, whole.lumi[:, :, ::-1])
+    np.testing.assert_array_equal(mirrored.images, whole.images[:, :, ::-1])
+
+
+def test_examples_speak_the_runtime_s_language(views) -> None:
+    _, sample = pairs(views, "replace", 1)[0]
+    light, mask = draw(np.random.default_rng(0), NumpyOps(), sample)
+    made = example(sample, (light, mask), "relight")
+    photo = NumpyOps().decode_srgb(NumpyOps().encode_srgb(sample.photo, np.uint8))
+    encoded = NumpyOps().encode_srgb(photo, np.float32)
+    condition = mini.encode(encoded, Strokes(light, mask), "relight")
+    for name in ("photo", "light", "mask"):
+        np.testing.assert_allclose(made[name][None], condition[name], atol=1e-5)
+    assert int(made["mode"]) == mini.MODES["relight"]
+    shown = made["photo"] + made["x0"] / 4
+    np.testing.assert_allclose(
+        shown.permute(1, 2, 0), NumpyOps().encode_srgb(sample.relit, np.float32), atol=1e-5
+    )
+    estimate = example(sample, None, "estimate")
+    assert not estimate["mask"].any() and not estimate["light"].any()
+    assert int(estimate["mode"]) == mini.MODES["estimate"]
+    found = decode_light((estimate["x0"] + 1) / 2).permute(1, 2, 0)
+    np.testing.assert_allclose(found, sample.source, rtol=1e-3, atol=1e-5)
+
+
+def batch(views, number: int, **options) -> dict[str, torch.Tensor]:
+    return next(iter(Batches(views, 3, **{"seed": 4, "start": number, **options})))
+
+
+def same(one: dict, other: dict) -> bool:
+    return all(one[name].shape == other[name].shape and torch.equal(one[name], other[name]) for name in one)
+
+
+def test_batches_repeat_by_number_and_differ_between_numbers_seeds_and_ranks(views) -> None:
+    stream = iter(Batches(views, 3, seed=4))
+    first, second, third = (next(stream) for _ in range(3))
+    assert same(third, batch(views, 2)) and same(first, batch(views, 0))
+    others = second, batch(views, 0, seed=5), batch(views, 0, rank=1)
+    assert not any(same(first, other) for other in others)
+
+
+def test_batches_have_the_network_s_shapes_and_ranges(views) -> None:
+    shapes = set()
+    for number in range(8):
+        made = batch(views, number)
+        height, width = made["photo"].shape[2:]
+        shapes.add((height, width))
+        assert (height, width) in GRIDS
+        assert made["photo"].shape == made["light"].shape == made["x0"].shape == (3, 3, height, width)
+        assert made["mask"].shape == (3, 1, height, width) and made["mode"].shape == (3,)
+        assert made["mode"].dtype == torch.int64 and made["x0"].dtype == torch.float32
+        assert 0 <= made["photo"].min() and made["photo"].max() <= 1 and made["light"].min() >= 0
+        assert made["x0"].isfinite().all()
+        bytes_of = made["photo"] * 255
+        torch.testing.assert_close(bytes_of, bytes_of.round(), atol=1e-3, rtol=0)
+    assert len(shapes) > 1
+
+
+def test_shares_say_how_many_estimate_and_how_many_draw_nothing(views) -> None:
+    estimating = batch(views, 0, shares=Mix(estimate=1.0))
+    assert (estimating["mode"] == 1).all() and not estimating["mask"].any()
+    silent = batch(views, 0, shares=Mix(estimate=0.0, null=1.0))
+    assert (silent["mode"] == 0).all() and not silent["mask"].any()
+    drawn = batch(views, 0, shares=Mix(estimate=0.0, null=0.0))
+    assert (drawn["mode"] == 0).all() and drawn["mask"].flatten(1).any(dim=1).all()
+    kept = drawn["photo"] + drawn["x0"] / 4
+    assert kept.min() > -1e-5 and kept.max() < 1 + 1e-5
+    assert float(linear_to_srgb(torch.tensor(1.0))) == pytest.approx(1)
