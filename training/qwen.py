@@ -42,10 +42,8 @@ UNREAD: Final = ["attn.add_q_proj", "attn.to_add_out", "txt_mlp.net.0.proj", "tx
 class Qwen(nn.Module):
     """The transformer with its LoRA: velocity of latents (B, z, h, w) under references of the same shape."""
 
-    def __init__(
-        self, transformer: QwenImageTransformer2DModel, prompts: dict[int, Tensor], rank: int
-    ) -> None:
-        """transformer: a QwenImageTransformer2DModel. prompts: mode -> embeddings (T, D). Only the LoRA learns."""
+    def __init__(self, transformer: Any, prompts: dict[int, Tensor], rank: int) -> None:
+        """transformer: a QwenImageTransformer2DModel. prompts: mode -> embeddings (T, D)."""
         super().__init__()
         self.transformer = transformer.requires_grad_(False)
         self.transformer.enable_gradient_checkpointing()
@@ -69,9 +67,9 @@ class Qwen(nn.Module):
         return torch.stack([self._one(*sample) for sample in samples])
 
     def _one(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mode: int) -> Tensor:
-        """Sample by sample: the modes differ in their prompts' lengths and in how many references they have."""
+        """One sample: the modes differ in the length of their prompts and the number of references."""
         pictures = [x, photo, light] if mode == MODES["relight"] else [x, photo]
-        channels, rows, columns = x.shape
+        rows, columns = x.shape[1:]
         tokens = torch.cat([pack(picture) for picture in pictures])
         velocity = self.transformer(
             hidden_states=tokens[None],
@@ -115,8 +113,9 @@ class Pictures:
     def encode(self, pictures: Tensor) -> Tensor:
         """sRGB 0..1 (B, 3, h, w), resized to the area -> latents (B, z, h', w'), normalised."""
         size = fit_area(self.area, pictures.shape[2], pictures.shape[3], MULTIPLE)
-        pixels = F.interpolate(pictures.clamp(0, 1), size, mode="bicubic", antialias=True).clamp(0, 1)
-        self.vae.to(pixels.device)
+        self.vae.to(pictures.device)
+        pictures = pictures.to(self.vae.dtype).clamp(0, 1)
+        pixels = F.interpolate(pictures, size, mode="bicubic", antialias=True).clamp(0, 1)
         latents = self.vae.encode(2 * pixels[:, :, None] - 1).latent_dist.mode()[:, :, 0]
         return (latents - self.mean.to(latents)) / self.std.to(latents)
 

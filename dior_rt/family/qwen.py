@@ -20,7 +20,7 @@ from PIL import Image
 from dior_rt.bundle import Bundle
 from dior_rt.errors import BundleError, InputError
 from dior_rt.family import Mode
-from dior_rt.family.qwen_config import MODULATION, PROMPTS, read_settings
+from dior_rt.family.qwen_config import LUMI_SCALE, MODULATION, PROMPTS, read_settings
 from dior_rt.family.qwen_frame import Frame, fit_content, resize
 from dior_rt.family.qwen_layers import Layers
 from dior_rt.family.qwen_prompt import Features, PromptEncoder
@@ -31,7 +31,6 @@ from dior_rt.sampler import Array, Velocity, guide
 from dior_rt.schedule import DynamicShiftSchedule
 
 NEGATIVE: Final[dict[Mode, str]] = {"relight": "relight_negative", "estimate": "estimate_negative"}
-LUMI_SCALE: Final = np.float32(8)
 SAME_SIGMA: Final = 1e-6
 MUCH_SMALLER: Final = 1.2  # what is nearer to the model's size is seen as it is
 
@@ -180,7 +179,7 @@ class Qwen:
 
     def undraw(self, picture: Array) -> Array:
         """A picture 0..1 of a Lumi map -> linear light >= 0: the inverse of `draw`."""
-        return np.expm1(picture * np.log1p(LUMI_SCALE * np.float32(self.settings.lumi_peak))) / LUMI_SCALE
+        return np.expm1(picture * np.float32(np.log1p(LUMI_SCALE * self.settings.lumi_peak))) / np.float32(LUMI_SCALE)
 
     def to_tokens(self, picture: NDArray[np.uint8]) -> Array:
         """A picture (h, w, 3), sRGB, of whole tokens -> its tokens (I, C)."""

@@ -23,7 +23,7 @@ from dior_rt.export.qwen.sources import MULTIPLE, Prompts, Sources
 from dior_rt.export.qwen.text import write_text_encoder
 from dior_rt.export.qwen.transformer import THETA, write_transformer
 from dior_rt.export.qwen.vae import write_decoder, write_encoder
-from dior_rt.family.qwen_config import FILE, MODULATION, PROMPTS, QwenSettings, TextSettings
+from dior_rt.family.qwen_config import FILE, LUMI_PEAK, MODULATION, PROMPTS, QwenSettings, TextSettings
 from dior_rt.family.qwen_layers import Layers
 from dior_rt.family.qwen_prompt import PromptEncoder
 from dior_rt.records import unparse
@@ -32,7 +32,6 @@ from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 AREA: Final = 1024**2
 VISION_AREA: Final = 384**2
-LUMI_PEAK: Final = 4.0
 BYTES: Final = {"fp32": 4.0, "fp16": 2.0, "int8": 1.0, "int4": 0.625}  # a weight
 LIGHTNING_SHIFT: Final = 3.0  # few-step LoRAs are trained with mu = ln 3, whatever the size
 

@@ -250,7 +250,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_blocks(tmp_path):
-    # 20 MB a block; were blocks kept, twelve would show 200 MB more than two.
+    # 25 MB a block; were blocks kept, twelve would show 250 MB more than two.
     peaks = {}
     for blocks in (2, 6, 12):
         folder = tmp_path / str(blocks)
