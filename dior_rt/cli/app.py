@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from dior_rt import __version__
-from dior_rt.cli import about, convert, pictures
+from dior_rt.cli import about, bench, convert, pictures
 from dior_rt.cli.extras import needs_extra
 
 app = typer.Typer(
@@ -21,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for body in (pictures.relight, pictures.estimate, pictures.sparsify, about.info, convert.export):
+for body in (pictures.relight, pictures.estimate, pictures.sparsify, about.info, bench.bench, convert.export):
     app.command()(body)
 
 

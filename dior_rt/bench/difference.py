@@ -1,0 +1,61 @@
+"""How far a picture is from the reference's: to the eye, and in its light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dior_rt.grid import GridRule
+from dior_rt.kernels import NumpyOps
+
+ROWS = 256  # compared at a time, so that a large picture needs no second one in float64
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Of a picture from the reference.
+
+    psnr: dB over the sRGB-encoded samples, peak 1; None where the pictures are identical. largest: of any
+    sample, in 1/255. light: sum |L - L_ref| / sum L_ref over the linear light L of the cells of a grid.
+    """
+
+    psnr: float | None
+    largest: float
+    light: float
+
+
+def compare_pictures(picture: NDArray, reference: NDArray) -> Difference:
+    """Compare two pictures (H, W, 3) of one integer dtype, sRGB-encoded. Raises ValueError for other ones."""
+    if picture.shape != reference.shape or picture.dtype != reference.dtype:
+        raise ValueError(
+            f"{picture.shape} of {picture.dtype} is not comparable to {reference.shape} of {reference.dtype}"
+        )
+    peak = float(np.iinfo(reference.dtype).max)
+    squares, largest = 0.0, 0.0
+    for row in range(0, len(reference), ROWS):
+        rows = slice(row, row + ROWS)
+        error = (picture[rows].astype(np.float64) - reference[rows]) / peak
+        squares += float(np.sum(error * error))
+        largest = max(largest, float(np.abs(error).max()))
+    psnr = -10 * math.log10(squares / reference.size) if squares else None
+    return Difference(psnr, 255 * largest, _light_error(picture, reference))
+
+
+def worst(differences: Sequence[Difference]) -> Difference:
+    """The worst of each figure."""
+    return Difference(
+        min((d.psnr for d in differences if d.psnr is not None), default=None),
+        max(d.largest for d in differences),
+        max(d.light for d in differences),
+    )
+
+
+def _light_error(picture: NDArray, reference: NDArray) -> float:
+    ops, grid = NumpyOps(), GridRule().shape(*reference.shape[:2])
+    light, wanted = ops.reduce_photo(picture, grid), ops.reduce_photo(reference, grid)
+    # A black reference has no light that an error could be relative to; the smallest float keeps it finite.
+    return float(np.abs(light - wanted).mean() / max(wanted.mean(), np.finfo(np.float32).tiny))

@@ -1,0 +1,189 @@
+"""What a benchmark found: kept as JSON, shown as Markdown, compared with an older one."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Final, Literal
+
+from dior_rt.bench.difference import Difference
+from dior_rt.bench.flops import step_flops
+from dior_rt.bench.machine import Machine, Rooflines
+from dior_rt.bench.plan import Setting
+from dior_rt.bench.run import Measured, Outcome
+from dior_rt.bench.worker import Pair
+from dior_rt.bundle import Bundle
+from dior_rt.errors import InputError
+from dior_rt.files import check_readable, reason, replacing
+from dior_rt.pictures import Photo
+from dior_rt.records import parse, read_json, unparse
+
+FORMAT: Final = 1
+MOST_BYTES = 16 << 20
+
+
+@dataclass(frozen=True)
+class BundleFacts:
+    """A bundle that was measured."""
+
+    folder: str
+    name: str
+    precision: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """A photo that was measured with; its file's hash and that of its strokes."""
+
+    name: str
+    sha256: str
+    strokes_sha256: str
+    height: int
+    width: int
+    bits: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """What one setting takes and costs.
+
+    ratio: the reference's total seconds by this one's. seconds, start_up, start_up_cold, peak_bytes: see
+    `Measured`. step_flops: of one step, the mean over the photos. gemm_share: what a step reaches of the
+    machine's GEMM rate; only where the CPU's cores all take part. copy_share: what the kernels reach of the
+    copy bandwidth of the memory that they work in, see `copy_share`. None: not known.
+    """
+
+    name: str
+    setting: Setting
+    ratio: float
+    seconds: dict[str, float]
+    per_step: float
+    images_a_minute: float
+    start_up: float
+    start_up_cold: float
+    peak_bytes: int | None
+    difference: Difference
+    step_flops: float | None
+    gemm_share: float | None
+    copy_share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """One benchmark. results: the reference first. failed: setting -> why it could not be run."""
+
+    format: Literal[1] = FORMAT
+    machine: Machine
+    bundles: tuple[BundleFacts, ...]
+    photos: tuple[PhotoFacts, ...]
+    repeats: int
+    rooflines: Rooflines
+    results: tuple[Result, ...]
+    failed: dict[str, str]
+
+
+def make_report(
+    outcome: Outcome,
+    machine: Machine,
+    bundles: Sequence[Bundle],
+    pairs: Sequence[Pair],
+    photos: Sequence[Photo],
+    repeats: int,
+) -> Report:
+    """Put together what was measured; photos: the pairs', as read."""
+    reference = next(iter(outcome.measured))
+    return Report(
+        machine=machine,
+        bundles=tuple(
+            BundleFacts(str(b.folder), b.manifest.name, b.manifest.precision, b.sha256) for b in bundles
+        ),
+        photos=tuple(map(_photo_facts, pairs, photos)),
+        repeats=repeats,
+        rooflines=outcome.rooflines,
+        results=tuple(
+            _result(setting, measured, outcome, bundles, photos)
+            for setting, measured in outcome.measured.items()
+        ),
+        failed={setting.name(reference): why for setting, why in outcome.failed.items()},
+    )
+
+
+def copy_share(photo_bytes: float, seconds: float, bandwidth: float) -> float:
+    """The share of the copy bandwidth that the kernels reach.
+
+    The least that they must move: read the photo to reduce it, read it again and write it to transfer light,
+    3 x photo_bytes. What they move besides, such as strokes and tables, is overhead.
+    """
+    return 3 * photo_bytes / seconds / bandwidth
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write it as JSON, whole or not at all. Raises InputError."""
+    with replacing(path) as file:
+        file.write((json.dumps(unparse(report), indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_report(path: Path) -> Report:
+    """Read what `write_report` wrote. Raises InputError for a file that is missing or something else."""
+    check_readable(path, "benchmark")
+    try:
+        return parse(Report, read_json(path, MOST_BYTES))
+    except (OSError, ValueError) as error:
+        raise InputError(f"Cannot read the benchmark {path}: {reason(error)}.") from error
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Which (seconds, decibels) no other point beats in one and equals or beats in the other; by seconds."""
+    front, best = [], float("-inf")
+    for index in sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1])):
+        if points[index][1] > best:
+            front.append(index)
+            best = points[index][1]
+    return front
+
+
+def _result(
+    setting: Setting, measured: Measured, outcome: Outcome, bundles: Sequence[Bundle], photos: Sequence[Photo]
+) -> Result:
+    reference = next(iter(outcome.measured))
+    seconds = measured.seconds
+    per_step = seconds["steps"] / setting.steps
+    bundle = next(b for b in bundles if str(b.folder) == setting.bundle)
+    counts = [step_flops(bundle, photo.size, setting.guidance) for photo in photos]
+    flops = fmean(count for count in counts if count) if all(counts) else None
+    whole_cpu = setting.device == "cpu" and setting.threads is None
+    return Result(
+        name=setting.name(reference),
+        setting=setting,
+        ratio=outcome.measured[reference].seconds["total"] / seconds["total"],
+        seconds=seconds,
+        per_step=per_step,
+        images_a_minute=60 / seconds["total"],
+        start_up=measured.start_up,
+        start_up_cold=measured.start_up_cold,
+        peak_bytes=measured.peak_bytes,
+        difference=measured.difference,
+        step_flops=flops,
+        gemm_share=flops / per_step / outcome.rooflines.gemm if flops and whole_cpu else None,
+        copy_share=copy_share(
+            fmean(photo.pixels.nbytes for photo in photos),
+            seconds["kernels"] + seconds["transfer"],
+            outcome.rooflines.copy[setting.ops],
+        ),
+    )
+
+
+def _photo_facts(pair: Pair, photo: Photo) -> PhotoFacts:
+    return PhotoFacts(
+        Path(pair.photo).name, _sha256(pair.photo), _sha256(pair.strokes), *photo.size, photo.bits
+    )
+
+
+def _sha256(path: str) -> str:
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,170 @@
+"""Run the plan: every setting in processes of its own, by turns."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+
+from dior_rt.bench.difference import Difference, compare_pictures, worst
+from dior_rt.bench.machine import Rooflines, measure_rooflines, medians
+from dior_rt.bench.plan import Setting, interleave
+from dior_rt.bench.worker import STAGES, Job, Pair, Sample
+from dior_rt.errors import DeviceError, DiorError
+from dior_rt.files import reason
+from dior_rt.pictures import read_photo
+from dior_rt.records import parse, unparse
+
+Advance = Callable[[str], None]  # called before every run, with what runs
+
+#: Where compiled kernels are kept: by pyopencl, by PoCL, by NVIDIA's driver.
+CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A setting's medians over the repeats, and the worst photo's difference from the reference.
+
+    seconds: of one photo, by stage, and their sum as "total". start_up_cold: with no compiled kernel there
+    yet; start_up: with all of them. peak_bytes: of memory, the median of the repeats.
+    """
+
+    seconds: dict[str, float]
+    start_up: float
+    start_up_cold: float
+    peak_bytes: int | None
+    difference: Difference
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """measured: by setting, in the plan's order. failed: why others could not be run, one sentence each."""
+
+    measured: dict[Setting, Measured]
+    failed: dict[Setting, str]
+    rooflines: Rooflines
+
+
+def count_runs(settings: Sequence[Setting], repeats: int) -> int:
+    """How often `measure` calls `advance` where nothing fails."""
+    return len(set(map(_host, settings))) + repeats * (len(settings) + 1)
+
+
+def measure(
+    settings: Sequence[Setting],
+    pairs: Sequence[Pair],
+    repeats: int,
+    advance: Advance,
+    *,
+    strict: bool = False,
+) -> Outcome:
+    """Measure the settings, of which the first is the reference, and the machine's rooflines.
+
+    strict: raise DeviceError where any setting fails, not only where the reference does. All are tried
+    before the first is timed.
+    """
+    reference = settings[0]
+    with tempfile.TemporaryDirectory(prefix="dior-bench-") as scratch:
+        caches = {host: Path(scratch) / f"cache-{i}" for i, host in enumerate(map(_host, settings))}
+        folders = {setting: Path(scratch) / f"pictures-{i}" for i, setting in enumerate(settings)}
+        for folder in (*caches.values(), *folders.values()):
+            folder.mkdir(exist_ok=True)
+        failed: dict[Setting, str] = {}
+
+        def attempt(setting: Setting, plan: Setting, pairs: Sequence[Pair]) -> list[Sample]:
+            """Run `plan` on behalf of a setting, unless that has failed already."""
+            if setting in failed:
+                return []
+            try:
+                return [run(plan, pairs, folders[setting], caches[_host(setting)])]
+            except DiorError as error:
+                if strict or setting == reference:
+                    raise
+                failed[setting] = reason(error)
+                return []
+
+        cold: dict[Setting, Sample] = {}
+        for setting in settings:
+            host = _host(setting)
+            if host not in cold:
+                advance("cold start")
+                for sample in attempt(setting, host, pairs[:1]):
+                    cold[host] = sample
+        samples: dict[Setting, list[Sample]] = {setting: [] for setting in settings}
+        rooflines = []
+        for setting in interleave(settings, repeats):
+            if setting == reference:
+                advance("rooflines")
+                rooflines.append(
+                    measure_rooflines(sorted({one.ops for one in settings if one not in failed}))
+                )
+            advance(setting.name(reference))
+            samples[setting] += attempt(setting, setting, pairs)
+        running = [setting for setting in settings if setting not in failed]
+        differences = _differences(running, folders, len(pairs))
+    measured = {
+        setting: _summary(samples[setting], cold[_host(setting)], differences[setting]) for setting in running
+    }
+    return Outcome(measured, failed, medians(rooflines))
+
+
+def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Sample:
+    """One run in a process of its own; its pictures go to `out`, its compiled kernels to `cache`.
+
+    Raises DeviceError with what the process says, or how it ended.
+    """
+    job = Job(setting, tuple(pairs), str(out), time.monotonic())
+    process = subprocess.run(
+        [sys.executable, "-m", "dior_rt.bench.worker"],
+        input=json.dumps(unparse(job)),
+        capture_output=True,
+        text=True,
+        env=os.environ | dict.fromkeys(CACHES, str(cache)),
+    )
+    try:
+        answer = json.loads(process.stdout.splitlines()[-1])
+        if "error" in answer:
+            raise DeviceError(answer["error"])
+        return parse(Sample, answer)
+    except (ValueError, IndexError, TypeError):
+        said = process.stderr.strip().splitlines() or ["it left no word"]
+        where = f"{setting.device} and {setting.ops}"
+        raise DeviceError(f"The run on {where} ended with code {process.returncode}: {said[-1]}.") from None
+
+
+def _host(setting: Setting) -> Setting:
+    """What a start-up depends on: the setting with all else as small as can be."""
+    return replace(setting, steps=1, guidance=1.0, threads=None)
+
+
+def _differences(
+    settings: Sequence[Setting], folders: dict[Setting, Path], photos: int
+) -> dict[Setting, Difference]:
+    found: dict[Setting, list[Difference]] = {setting: [] for setting in settings}
+    for index in range(photos):
+        reference = read_photo(folders[settings[0]] / f"{index}.png").pixels
+        for setting in settings:
+            picture = read_photo(folders[setting] / f"{index}.png").pixels
+            found[setting].append(compare_pictures(picture, reference))
+    return {setting: worst(differences) for setting, differences in found.items()}
+
+
+def _summary(samples: Sequence[Sample], cold: Sample, difference: Difference) -> Measured:
+    seconds = {stage: median(sample.seconds[stage] for sample in samples) for stage in STAGES}
+    # The median of the sums: stages that are slow by turns must not cancel out.
+    seconds["total"] = median(sum(sample.seconds.values()) for sample in samples)
+    peaks = [sample.peak_bytes for sample in samples if sample.peak_bytes is not None]
+    return Measured(
+        seconds,
+        median(sample.start_up for sample in samples),
+        cold.start_up,
+        int(median(peaks)) if peaks else None,
+        difference,
+    )

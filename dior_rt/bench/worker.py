@@ -1,0 +1,114 @@
+"""One run of one setting, in a process of its own, so that its peak of memory and its start-up are its own.
+
+Reads a Job as JSON from its input; the last line of its output is a Sample, or {"error": sentence}.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from dior_rt.bench.plan import Setting
+from dior_rt.errors import DiorError, InputError
+from dior_rt.records import parse, unparse
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A photo and the light drawn on it, as files."""
+
+    photo: str
+    strokes: str
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do. out: the folder for the pictures, 0.png and so on. spawned: `time.monotonic()` of the
+    parent when it started this process; the clock is that of the whole system."""
+
+    setting: Setting
+    pairs: tuple[Pair, ...]
+    out: str
+    spawned: float
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one run took.
+
+    seconds: for one photo, the mean over the photos, by stage: read, kernels, steps, transfer, write.
+    start_up: from the start of the process to the end of the first step, loading included.
+    peak_bytes: the most memory that the process held at once; None where the system does not say.
+    """
+
+    seconds: dict[str, float]
+    start_up: float
+    peak_bytes: int | None
+
+
+STAGES = ("read", "kernels", "steps", "transfer", "write")
+
+
+def work(job: Job) -> Sample:
+    """Relight every pair once to warm up, with a single step, and once for the clock."""
+    import numpy as np
+
+    from dior_rt.relight import Relighter, Stopwatch
+
+    setting, sums, started = job.setting, dict.fromkeys(STAGES, 0.0), []
+    relighter = Relighter(setting.bundle, setting.device, setting.ops, setting.threads)
+
+    def first_step(step: int, steps: int) -> None:
+        started.append(time.monotonic() - job.spawned)
+
+    from dior_rt.pictures import read_photo, write_photo
+    from dior_rt.strokes import read_strokes
+
+    for index, pair in enumerate(job.pairs):
+        watch = Stopwatch()
+        photo = read_photo(Path(pair.photo))
+        strokes = read_strokes(Path(pair.strokes), photo.size)
+        watch.lap("read")
+        relighter.relight(photo.pixels, strokes, steps=1, guidance=setting.guidance, progress=first_step)
+        relit = relighter.relight(photo.pixels, strokes, steps=setting.steps, guidance=setting.guidance)
+        if relit.notice:
+            raise InputError(f"{pair.strokes} cannot be measured with: {relit.notice}")
+        watch.lap("relight")
+        write_photo(Path(job.out) / f"{index}.png", photo.with_pixels(np.asarray(relit.picture)), {})
+        watch.lap("write")
+        for stage in STAGES:
+            sums[stage] += (watch.seconds | relit.seconds)[stage]
+    means = {stage: total / len(job.pairs) for stage, total in sums.items()}
+    return Sample(means, started[0], peak_memory())
+
+
+def peak_memory() -> int | None:
+    """The most bytes of memory that this process held at once."""
+    try:
+        # Not getrusage where there is better: on Linux its figure begins with the parent's at the fork.
+        status = Path("/proc/self/status").read_text()
+        return next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def main() -> None:
+    """The process."""
+    try:
+        answer = unparse(work(parse(Job, json.load(sys.stdin))))
+    except DiorError as error:
+        answer = {"error": str(error)}
+    print(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main()
