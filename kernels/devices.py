@@ -1,4 +1,4 @@
-"""What OpenCL devices there are, and the choice among them. pyopencl is imported only here and in opencl_ops.py."""
+"""What OpenCL devices there are, and the choice among them. pyopencl is imported only on demand."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dior_rt.kernels.types import KernelError
 
 @dataclass(frozen=True)
 class Device:
-    """An OpenCL device. index: its number in `list_devices()`; type: "gpu", "cpu", "accelerator" or "other"."""
+    """An OpenCL device. index: its place in `list_devices()`; type: "gpu", "cpu", "accelerator", "other"."""
 
     index: int
     name: str
@@ -23,7 +23,7 @@ class Device:
 
 
 def list_devices() -> list[Device]:
-    """Every OpenCL device of every platform, in the platforms' order. Raises KernelError where there is no OpenCL."""
+    """Every OpenCL device, in the platforms' order. Raises KernelError where there is no OpenCL at all."""
     try:
         import pyopencl as cl
     except ImportError as error:
@@ -48,10 +48,10 @@ def list_devices() -> list[Device]:
 def open_ops(name: str = "auto") -> Ops:
     """The Ops of that name, self-tested; `reason` says why it was chosen.
 
-    "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose name
-    contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that fails gives
-    way to the next, and the reason says so. Raises KernelError, one sentence, where what was named cannot be had.
-    """
+    "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose
+    name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that
+    fails gives way to the next, and the reason says so. Raises KernelError where what was named cannot be
+    had."""
     if name == "numpy":
         return NumpyOps()
     if name == "auto":
@@ -68,7 +68,7 @@ def open_ops(name: str = "auto") -> Ops:
 
 
 def open_device(device: Device) -> Ops:
-    """The Ops of one OpenCL device, self-tested. Raises KernelError if it cannot be opened or computes wrongly."""
+    """The Ops of one device, self-tested. Raises KernelError if it cannot be opened or computes wrongly."""
     from dior_rt.kernels.opencl_ops import OpenCLOps
 
     ops = OpenCLOps(device)

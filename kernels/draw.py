@@ -15,22 +15,18 @@ darkens at an edge.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from dior_rt.kernels.types import FloatArray, Stroke
 
 #: Side of the square tiles for which segments are listed.
 TILE = 32
-SEGMENT = np.dtype(
-    [
-        ("ends", np.float32, 4),
-        ("radius", np.float32),
-        ("softness", np.float32),
-        ("strength", np.float32),
-        ("stroke", np.int32),
-    ]
-)
+#: The record that draw.cl calls Segment.
+SEGMENT = np.dtype("(4,)f4, f4, f4, f4, i4")
+SEGMENT.names = ("ends", "radius", "softness", "strength", "stroke")
 
 
 def segments(stroke: Stroke) -> FloatArray:
@@ -64,37 +60,47 @@ def coverage(stroke: Stroke, distance: FloatArray) -> FloatArray:
     return np.float32(min(stroke.width, 1.0)) * (t + np.float32(soft) * (smooth - t))
 
 
+@dataclass(frozen=True)
 class Plan:
     """Strokes laid out for a device: which segments may touch which tile of TILE x TILE pixels.
 
-    segments: one record a segment (see draw.cl); lights: (strokes, 4) float32, linear RGB and 1. The segments that
-    may touch tile t, row by row, are entries[first[t]:first[t + 1]], in the order of their strokes.
-    """
+    segments: one SEGMENT each; lights: (strokes, 4) float32, linear RGB and 1. The segments that may touch
+    tile t, row by row, are entries[first[t]:first[t + 1]], in the order of their strokes."""
 
-    def __init__(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> None:
-        """size: (H, W) of the picture."""
-        rows, columns = (-(-side // TILE) for side in size)
-        parts, tiles = [], []
-        for number, stroke in enumerate(strokes):
-            ends = segments(stroke)
-            record = np.empty(len(ends), SEGMENT)
-            record["ends"], record["radius"], record["softness"] = ends, radius(stroke), stroke.softness
-            record["strength"], record["stroke"] = min(stroke.width, 1.0), number
-            parts.append(record)
-            tiles += [_tiles(segment, radius(stroke) + 1, rows, columns) for segment in ends]
-        self.segments = np.concatenate(parts)
-        self.lights = np.array([[*stroke.light, 1.0] for stroke in strokes], np.float32)
-        segment = np.repeat(np.arange(len(tiles)), [len(touched) for touched in tiles])
-        tile = np.concatenate(tiles)
-        order = np.argsort(tile, kind="stable")
-        self.entries = np.append(segment[order], 0).astype(np.int32)
-        self.first = np.searchsorted(tile[order], np.arange(rows * columns + 1)).astype(np.int32)
+    segments: np.ndarray
+    lights: FloatArray
+    first: npt.NDArray[np.int32]
+    entries: npt.NDArray[np.int32]
+
+
+def plan(strokes: Sequence[Stroke], size: tuple[int, int]) -> Plan:
+    """At least one stroke, over a picture of (H, W) pixels."""
+    rows, columns = (-(-side // TILE) for side in size)
+    parts, tiles = [], []
+    for number, stroke in enumerate(strokes):
+        ends = segments(stroke)
+        record = np.empty(len(ends), SEGMENT)
+        record["ends"], record["radius"], record["softness"] = ends, radius(stroke), stroke.softness
+        record["strength"], record["stroke"] = min(stroke.width, 1.0), number
+        parts.append(record)
+        tiles += [_tiles(segment, radius(stroke) + 1, rows, columns) for segment in ends]
+    segment = np.repeat(np.arange(len(tiles)), [len(touched) for touched in tiles])
+    tile = np.concatenate(tiles)
+    order = np.argsort(tile, kind="stable")
+    return Plan(
+        np.concatenate(parts),
+        np.array([[*stroke.light, 1.0] for stroke in strokes], np.float32),
+        np.searchsorted(tile[order], np.arange(rows * columns + 1)).astype(np.int32),
+        # One more than there are, for no buffer may be empty.
+        np.append(segment[order], 0).astype(np.int32),
+    )
 
 
 def _tiles(segment: FloatArray, margin: float, rows: int, columns: int) -> np.ndarray:
-    """The numbers of the tiles whose middle is near enough to the segment for any of their pixels to be drawn."""
-    box = np.array([segment[0::2].min(), segment[0::2].max(), segment[1::2].min(), segment[1::2].max()])
-    left, right, top, bottom = np.floor((box + [-margin, margin, -margin, margin]) / TILE)
+    """The tiles whose middle is so near to the segment that a pixel of theirs may be drawn."""
+    x0, y0, x1, y1 = segment
+    left, right = (min(x0, x1) - margin) // TILE, (max(x0, x1) + margin) // TILE
+    top, bottom = (min(y0, y1) - margin) // TILE, (max(y0, y1) + margin) // TILE
     x = np.arange(max(left, 0), min(right + 1, columns), dtype=np.int64)
     y = np.arange(max(top, 0), min(bottom + 1, rows), dtype=np.int64)[:, None]
     middle_x, middle_y = ((at.astype(np.float32) + np.float32(0.5)) * TILE for at in (x, y))

@@ -8,13 +8,13 @@ import numpy as np
 
 from dior_rt.kernels.types import FloatArray
 
-#: Rows are worked on in bands of about this many pixels, so that memory stays bounded.
-BAND_PIXELS = 1 << 18
+#: Pixels in a band by default, so that memory stays bounded however large the picture.
+BAND = 1 << 18
 
 
-def bands(height: int, width: int) -> Iterator[slice]:
-    """Slices of rows, in order, of about BAND_PIXELS pixels each and at least one row."""
-    rows = max(1, BAND_PIXELS // width)
+def bands(height: int, width: int, pixels: int = BAND) -> Iterator[slice]:
+    """Slices of rows, in order, of about `pixels` pixels each and at least one row."""
+    rows = max(1, pixels // width)
     for top in range(0, height, rows):
         yield slice(top, min(height, top + rows))
 
@@ -32,9 +32,9 @@ def area_weights(pixels: int, cells: int) -> FloatArray:
 
 
 def spline_taps(pixels: int, cells: int) -> tuple[np.ndarray, FloatArray]:
-    """The cell each pixel's centre lies in, and the quadratic B-spline's weights of the one before, it, the one after.
+    """The cell that each pixel's centre lies in, and the quadratic B-spline's weights of the cells around it.
 
-    (pixels,) integers and (3, pixels) float32.
+    (pixels,) integers, and (3, pixels) float32 for the cell before, the cell itself, the one after.
     """
     centre = (2 * np.arange(pixels, dtype=np.int64) + 1) * cells
     cell = centre // (2 * pixels)

@@ -1,4 +1,4 @@
-"""An opened OpenCL device: its programs, its buffers, and how a kernel is launched. Knows nothing of pictures."""
+"""An opened OpenCL device: its programs, its buffers, how a kernel is launched. Knows nothing of pictures."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from dior_rt.kernels.devices import Device
 
 SOURCES = Path(__file__).parent
+#: How many neighbours one work item takes on a CPU.
+CPU_RUN = 4096
 
 
 class Session:
@@ -26,7 +28,7 @@ class Session:
     """
 
     def __init__(self, device: Device) -> None:
-        """Open the device. Programs are built when first needed. Raises KernelError if it cannot be opened."""
+        """Programs are built when first needed. Raises KernelError if the device cannot be opened."""
         self.name = f"opencl:{device.index} ({device.name})"
         try:
             self._context = cl.Context([device.handle])
@@ -34,12 +36,13 @@ class Session:
             self._shares_memory = bool(device.handle.host_unified_memory)
         except cl.Error as error:
             raise KernelError(f"{self.name} cannot be opened ({error}).") from error
+        self._run = CPU_RUN if device.type == "cpu" else 1
         self._lock = threading.Lock()
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._constants: dict[int, tuple[np.ndarray, cl.Buffer]] = {}
 
     def kernel(self, name: str, sources: str, **defines: object) -> cl.Kernel:
-        """The kernel of that name, from the .cl files `sources` (parted by blanks), built with -D key=value."""
+        """The kernel of that name from the .cl files `sources`, parted by blanks, built with -Dkey=value."""
         options = tuple(f"-D{key}={value}" for key, value in defines.items())
         with self._lock:
             program = self._programs.get((sources, options))
@@ -49,13 +52,17 @@ class Session:
                 self._programs[sources, options] = program
         return cl.Kernel(program, name)
 
-    def launch(self, kernel: cl.Kernel, items: tuple[int, ...], *args: cl.Buffer | float | None) -> None:
-        """Run the kernel over `items` and wait, so that a buffer need not outlive the call. None is a null pointer.
+    def launch(self, kernel: cl.Kernel, count: int, rows: int, *args: cl.Buffer | int | None) -> None:
+        """Run the kernel over `rows` rows of `count` things and wait, so that no buffer need outlive the
+        call.
 
-        Integers are passed as int, floats as float.
-        """
-        scalars = {int: np.int32, float: np.float32}
-        kernel(self._queue, items, None, *(scalars.get(type(arg), lambda x: x)(arg) for arg in args)).wait()
+        One work item takes up to `run` neighbours on a row; the kernel gets `run` as its last argument. A CPU
+        wants few, long loops and work groups of one item (PoCL compiles a kernel anew for every shape of a
+        group); a GPU wants many items. None is a null pointer."""
+        items = -(-count // self._run), rows
+        group = (1, 1) if self._run > 1 else None
+        numbers = [np.int32(arg) if isinstance(arg, int) else arg for arg in (*args, self._run)]
+        kernel(self._queue, items, group, *numbers).wait()
 
     def constant(self, array: np.ndarray) -> cl.Buffer:
         """A copy of an array that lives as long as the session, once for each array."""
@@ -69,6 +76,10 @@ class Session:
         """An uninitialised buffer of `size` bytes on the device."""
         return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
 
+    def clear(self, buffer: cl.Buffer) -> None:
+        """Set every byte to 0."""
+        cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, buffer.size).wait()
+
     def input(self, array: np.ndarray) -> cl.Buffer:
         """The array as the device sees it; the array itself if it is contiguous and the memory is shared."""
         share = cl.mem_flags.USE_HOST_PTR if self._shares_memory else cl.mem_flags.COPY_HOST_PTR
@@ -76,7 +87,10 @@ class Session:
 
     @contextmanager
     def output(self, array: np.ndarray) -> Iterator[cl.Buffer]:
-        """A buffer for kernels to write all of; when the block ends, the contiguous array holds what they wrote."""
+        """A buffer for kernels to fill; when the block ends, the contiguous array holds what they wrote.
+
+        What they do not write is undefined where the device has its own memory.
+        """
         if not self._shares_memory:
             buffer = self.scratch(array.nbytes)
             yield buffer

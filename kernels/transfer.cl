@@ -1,7 +1,6 @@
 /* Quotient light at full size; the equations stand in transfer.py. Built after curve.cl. */
 
-/* 1 / q within 12 % for 1 <= q < 2^60, continuous and falling: the exponent and mantissa bits, negated. The weights of a
- * mean only need a shape, and this one costs an integer subtraction. */
+/* 1 / q within 12 % for 1 <= q < 2^60, continuous and falling: its exponent and mantissa bits, negated. */
 inline float rough_reciprocal(float q) { return as_float(0x7ef311c7 - as_int(q)); }
 
 /* The quadratic B-spline at offset d in -1/2..1/2 from the middle of three nodes. */
@@ -16,43 +15,70 @@ inline int first_pixel(int j, int pixels, int cells) {
   return (int)((2 * (long)j * pixels + cells - 1) / (2 * (long)cells));
 }
 
-/* Item (j, y): the pixels of row y of a band that lie in column j of the cells. nodes: (rows + 2, columns + 2) of
- * (log2 R, lightness), the border repeated; top: the band's first row in the photo. */
-__kernel void transfer(__global const SAMPLE *restrict photo, __global const float4 *restrict nodes,
-                       __global const float *restrict table, __global const SAMPLE *restrict start,
-                       __global const float *restrict threshold, __global SAMPLE *restrict result,
-                       int height, int width, int rows, int top) {
-  int columns = get_global_size(0), j = get_global_id(0), y = get_global_id(1);
-  long v = (2 * (long)(top + y) + 1) * rows;
-  int i = (int)(v / (2 * (long)height));
-  float down[3];
-  spline((float)(v - (2 * (long)i + 1) * height) / (2.0f * height), down);
-  float4 near[9];
-  for (int k = 0; k < 9; ++k) near[k] = nodes[(i + k / 3) * (columns + 2) + j + k % 3];
+inline float unit(float x) {
+  x = x > 0.0f ? x : 0.0f;
+  return x < 1.0f ? x : 1.0f;
+}
 
-  int first = first_pixel(j, width, columns), stop = first_pixel(j + 1, width, columns);
-  float step = (float)columns / width;
-  float offset = (float)((2 * (long)first + 1) * columns - (2 * (long)j + 1) * width) / (2.0f * width);
-  __global const SAMPLE *source = photo + 3 * ((size_t)y * width + first);
-  __global SAMPLE *target = result + 3 * ((size_t)y * width + first);
-  for (int x = 0; x < stop - first; ++x) {
-    SAMPLE red = source[3 * x], green = source[3 * x + 1], blue = source[3 * x + 2];
-    float g = clamp(((float)red + 2.0f * (float)green + (float)blue) * (0.25f / SCALE), 0.0f, 1.0f);
-    float across[3], weight = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
-    spline(offset + step * x, across);
+#if TOP
+/* x^(1/4) within 3e-7 of itself: a guess at x^(-1/4) by exponent arithmetic, then a minimax polynomial in its error. */
+inline float fourth_root(float x) {
+  float guess = as_float(0x4f581000 - (as_int(x) >> 2));
+  float root = x * guess * guess * guess, d = 1.0f - root * guess;
+  return root * (1.000000061f + d * (0.750000499f + d * (0.6561759444f
+               + d * (0.6013772391f + d * (0.5763343444f + d * 0.5538296185f)))));
+}
+
+/* The code of x. encode(x) is a minimax polynomial in the fourth root, within 6e-7 on 0..1: a code can differ from the
+ * exactly rounded one only where x lies that near to the border between two. */
+inline SAMPLE code_of(float x) {
+  x = unit(x);
+  float t = fourth_root(x);
+  float power = -0.05844407142f + t * (0.1235540544f + t * (1.461571078f + t * (-1.155788569f
+              + t * (1.208537755f + t * (-0.897374294f + t * (0.3939299771f + t * -0.07598623589f))))));
+  return (SAMPLE)(int)(TOP * (x <= 0.0031308f ? 12.92f * x : power) + 0.5f);
+}
+#else
+#define code_of(x) srgb_of(x)
+#endif
+
+inline float relit(float x, float log_r) { return x + (x + EPSILON) * (exp2_of(log_r) - 1.0f); }
+
+/* Item (k, y): row y of a band whose first row in the photo is `top`, in the cells k * run .. of that row. nodes:
+ * (rows + 2, columns + 2) of (log2 R, lightness), the border repeated. */
+__kernel void transfer(__global const SAMPLE *restrict photo, __global const float4 *restrict nodes,
+                       __global const float *restrict table, __global SAMPLE *restrict result,
+                       int height, int width, int rows, int columns, int top, int run) {
+  int y = get_global_id(1), begin = get_global_id(0) * run, end = columns - begin < run ? columns : begin + run;
+  long centre = (2 * (long)(top + y) + 1) * rows;
+  int i = (int)(centre / (2 * (long)height));
+  float down[3], step = (float)columns / width;
+  spline((float)(centre - (2 * (long)i + 1) * height) / (2.0f * height), down);
+  for (int j = begin; j < end; ++j) {
+    float4 near[9];
+    for (int k = 0; k < 9; ++k) near[k] = nodes[(i + k / 3) * (columns + 2) + j + k % 3];
+    int first = first_pixel(j, width, columns), count = first_pixel(j + 1, width, columns) - first;
+    float offset = (float)((2 * (long)first + 1) * columns - (2 * (long)j + 1) * width) / (2.0f * width);
+    __global const SAMPLE *restrict from = photo + 3 * ((size_t)y * width + first);
+    __global SAMPLE *restrict to = result + 3 * ((size_t)y * width + first);
+    for (int x = 0; x < count; ++x) {
+      SAMPLE red = from[3 * x], green = from[3 * x + 1], blue = from[3 * x + 2];
+      float g = unit(0.25f / WHOLE * ((float)red + 2.0f * (float)green + (float)blue));
+      float across[3], total = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
+      spline(offset + step * x, across);
 #pragma unroll
-    for (int k = 0; k < 9; ++k) {
-      float d = (g - near[k].w) * (1.0f / SIGMA);
-      float w = down[k / 3] * across[k % 3] * rough_reciprocal(1.0f + d * d);
-      weight += w;
-      r += w * near[k].x;
-      s += w * near[k].y;
-      t += w * near[k].z;
+      for (int k = 0; k < 9; ++k) {
+        float distance = (g - near[k].w) * (1.0f / SIGMA);
+        float weight = down[k / 3] * across[k % 3] * rough_reciprocal(1.0f + distance * distance);
+        total += weight;
+        r += weight * near[k].x;
+        s += weight * near[k].y;
+        t += weight * near[k].z;
+      }
+      float scale = 1.0f / total;
+      to[3 * x] = code_of(relit(DECODE(red), r * scale));
+      to[3 * x + 1] = code_of(relit(DECODE(green), s * scale));
+      to[3 * x + 2] = code_of(relit(DECODE(blue), t * scale));
     }
-    float scale = 1.0f / weight;
-    float a = DECODE(red), b = DECODE(green), c = DECODE(blue);
-    target[3 * x] = ENCODE(a + (a + EPSILON) * (fast_exp2(r * scale) - 1.0f));
-    target[3 * x + 1] = ENCODE(b + (b + EPSILON) * (fast_exp2(s * scale) - 1.0f));
-    target[3 * x + 2] = ENCODE(c + (c + EPSILON) * (fast_exp2(t * scale) - 1.0f));
   }
 }

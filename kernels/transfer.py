@@ -1,19 +1,19 @@
-"""Quotient light: carrying the light of a small grid over to the full-size photo without leaking across edges.
+"""Quotient light: the light of a small grid on the full-size photo, without leaking across edges.
 
     photo' = (photo + e) * R - e = photo + (photo + e) * (R - 1),     e = 0.02, linear light
 
-On the grid log2 R = log2((relit + e) / (source + e)). At a pixel it is the weighted mean of the 3 x 3 cells around
-the one it lies in (joint bilateral upsampling; Kopf, Cohen, Lischinski, Uyttendaele, 2007):
+On the grid log2 R = log2((relit + e) / (source + e)). At a pixel it is the weighted mean of the 3 x 3 cells
+around the one it lies in (joint bilateral upsampling; Kopf, Cohen, Lischinski, Uyttendaele, 2007):
 
-    w_k = B(dx) * B(dy) * 1 / (1 + (g - g_k)^2 / SIGMA^2)
+    w_k = B(dx) * B(dy) / (1 + (g - g_k)^2 / SIGMA^2)
 
 B is the quadratic B-spline, which is smooth across cells; g is the pixel's lightness and g_k the cell's. The
-reciprocal is taken within 12 % by exponent arithmetic, the same on every device: a weight only needs its shape.
+reciprocal is taken within 12 % by exponent arithmetic, the same on every device: a weight only needs its
+shape.
 
-A cell's value is a mean, so a smooth interpolation of the values would be flatter than the light was. Before it,
-log2 R is sharpened by what the spline will blur, and kept between the least and greatest of its 3 x 3 neighbours: no
-halo can come of it. R therefore never leaves the range of the grid's own quotients.
-"""
+A cell's value is a mean, so a smooth interpolation of the values would be flatter than the light was. Before
+it, log2 R is sharpened by what the spline will blur, and kept between the least and greatest of its 3 x 3
+neighbours: no halo can come of it, and R never leaves the range of the grid's own quotients."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def nodes(source: FloatArray, relit: FloatArray) -> FloatArray:
 
 
 def rough_reciprocal(q: FloatArray) -> FloatArray:
-    """1 / q within 12 % for 1 <= q < 2**60, continuous and falling: its exponent and mantissa bits, negated."""
+    """1 / q within 12 % for 1 <= q < 2**60, continuous and falling: its bits as an integer, negated."""
     return (np.int32(0x7EF311C7) - q.view(np.int32)).view(np.float32)
 
 
