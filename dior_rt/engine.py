@@ -40,15 +40,20 @@ class Engine:
     """
 
     def __init__(
-        self, model: Path, device: str = "cpu", threads: int | None = None, reason: str = ""
+        self,
+        model: Path,
+        device: str = "cpu",
+        threads: int | None = None,
+        reason: str = "",
+        arena: bool = True,
     ) -> None:
-        """Load `model`. threads: CPU threads for one operation; None leaves it to ONNX Runtime.
+        """Load `model`. threads, arena: as `open_session` takes them.
 
         Raises DeviceError for a device that is not there, BundleError for a file that is no ONNX graph.
         """
         self.device = device
         self.reason = reason or f"{device} was asked for"
-        self._session = open_session(model, device, threads)
+        self._session = open_session(model, device, threads, arena)
         self.inputs = tuple(map(_tensor, self._session.get_inputs()))
         self.outputs = tuple(map(_tensor, self._session.get_outputs()))
         # Only the CPU's provider promises to run one session from several threads at once.
@@ -98,22 +103,26 @@ class Binding:
             self._binding.bind_cpu_input(name, array)
 
 
-def open_engine(bundle: Bundle, graph: str, device: str = "auto", threads: int | None = None) -> Engine:
+def open_engine(
+    bundle: Bundle, graph: str, device: str = "auto", threads: int | None = None, *, arena: bool = True
+) -> Engine:
     """Load a graph of a bundle on a device, and hold it to the bundle's own answer.
 
     "auto" takes the first accelerator that is there and computes right, else the CPU; `engine.reason` says
     why. Raises DeviceError for a device that is not there or computes wrong results, and BundleError.
     """
     if device != "auto":
-        return _open_tested(bundle, graph, device, threads)
+        return _open_tested(bundle, graph, device, threads, arena=arena)
     failures = []
     for name in accelerators():
         try:
-            return _open_tested(bundle, graph, name, threads, f"{name} is there and passes its self-test")
+            return _open_tested(
+                bundle, graph, name, threads, f"{name} is there and passes its self-test", arena
+            )
         except DeviceError as error:
             failures.append(str(error))
     reason = " ".join(failures) or "ONNX Runtime finds no accelerator here"
-    return _open_tested(bundle, graph, "cpu", threads, reason)
+    return _open_tested(bundle, graph, "cpu", threads, reason, arena)
 
 
 def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
@@ -142,8 +151,10 @@ def _multiple(side: int | str) -> int:
     return int(factor) if star and factor.isdecimal() else 1
 
 
-def _open_tested(bundle: Bundle, graph: str, device: str, threads: int | None, reason: str = "") -> Engine:
-    engine = Engine(bundle.path(graph), device, threads, reason)
+def _open_tested(
+    bundle: Bundle, graph: str, device: str, threads: int | None, reason: str = "", arena: bool = True
+) -> Engine:
+    engine = Engine(bundle.path(graph), device, threads, reason, arena)
     promised = bundle.manifest.graphs[graph]
     if (engine.inputs, engine.outputs) != (promised.inputs, promised.outputs):
         raise BundleError(

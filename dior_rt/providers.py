@@ -62,12 +62,13 @@ def accelerators() -> list[str]:
     return [f"{name}:{choice}" if choice else name for name, choice in choices.items()]
 
 
-def open_session(model: Path, device: str, threads: int | None) -> ort.InferenceSession:
+def open_session(model: Path, device: str, threads: int | None, arena: bool = True) -> ort.InferenceSession:
     """Load a graph on a device, which takes all of it but the operations that it lacks; the CPU takes those.
 
-    threads: CPU threads for one operation; None leaves it to ONNX Runtime. Raises DeviceError for a device
-    that is not there or cannot be started, BundleError for a file that is no ONNX graph, and InputError for
-    threads below 1.
+    threads: CPU threads for one operation; None leaves it to ONNX Runtime. arena: keep a run's memory for the
+    next, which is faster; of many graphs that take turns, each would keep as much. Raises DeviceError for a
+    device that is not there or cannot be started, BundleError for a file that is no ONNX graph, and
+    InputError for threads below 1.
     """
     name, _, choice = device.partition(":")
     if name not in available() or (choice and not PROVIDERS[name].choice):
@@ -76,7 +77,7 @@ def open_session(model: Path, device: str, threads: int | None) -> ort.Inference
     options = {**provider.options, **({provider.choice: choice} if choice else {})}
     try:
         session = _start(
-            model, {provider.ort_name: options, cpu.ort_name: {}}, _session_options(name, threads)
+            model, {provider.ort_name: options, cpu.ort_name: {}}, _session_options(name, threads, arena)
         )
     except _ORT_ERRORS as error:
         # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
@@ -96,8 +97,9 @@ def translated(device: str) -> Iterator[None]:
         raise DeviceError(f"{device} failed: {reason(error)}.") from error
 
 
-def _session_options(name: str, threads: int | None) -> ort.SessionOptions:
+def _session_options(name: str, threads: int | None, arena: bool) -> ort.SessionOptions:
     options = ort.SessionOptions()
+    options.enable_cpu_mem_arena = arena
     options.log_severity_level = 3
     if threads is not None:
         if threads < 1:

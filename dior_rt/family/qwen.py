@@ -179,7 +179,8 @@ class Qwen:
 
     def undraw(self, picture: Array) -> Array:
         """A picture 0..1 of a Lumi map -> linear light >= 0: the inverse of `draw`."""
-        return np.expm1(picture * np.float32(np.log1p(LUMI_SCALE * self.settings.lumi_peak))) / np.float32(LUMI_SCALE)
+        span = np.float32(np.log1p(LUMI_SCALE * self.settings.lumi_peak))
+        return np.expm1(picture * span) / np.float32(LUMI_SCALE)
 
     def to_tokens(self, picture: NDArray[np.uint8]) -> Array:
         """A picture (h, w, 3), sRGB, of whole tokens -> its tokens (I, C)."""

@@ -56,7 +56,7 @@ GPUS: Final = {
 
 
 class RandomWeights:
-    """Weights of the shapes that a block has, made when they are asked for; the same name, the same weights."""
+    """Weights of the shapes that a block has, made when asked for; the same name, the same weights."""
 
     def __init__(self, config: TransformerConfig, index: int) -> None:
         block = empty_block(config)
@@ -144,10 +144,11 @@ def report(measured: Sequence[Measured], tokens: int) -> str:
         "precision  seconds  in torch  error    weights  | 60 blocks, 40 steps, guidance",
     ]
     for m in measured:
-        size, runs = RELEASED.num_layers * m.bytes / 1e9, RELEASED.num_layers * STEPS * BRANCHES
+        size, whole = m.bytes / 1e9, RELEASED.num_layers * m.bytes / 1e9
+        hours = RELEASED.num_layers * STEPS * BRANCHES * m.seconds / 3600
         lines.append(
-            f"{m.precision:9}  {m.seconds:7.2f}  {m.torch_seconds:8.2f}  {m.error:.1e}  {m.bytes / 1e9:4.2f} GB"
-            f"  | {size:5.1f} GB  {runs * m.seconds / 3600:6.1f} h"
+            f"{m.precision:9}  {m.seconds:7.2f}  {m.torch_seconds:8.2f}  {m.error:.1e}  {size:4.2f} GB"
+            f"  | {whole:5.1f} GB  {hours:6.1f} h"
         )
     total = operations * RELEASED.num_layers * STEPS * BRANCHES
     for name, (memory, tflops) in GPUS.items():
