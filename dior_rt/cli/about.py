@@ -11,6 +11,38 @@ import typer
 from dior_rt.cli import options
 
 
+def devices(
+    bundle: options.Bundle = None, as_json: options.Json = False, debug: options.Debug = False
+) -> None:
+    """List what can run the network and the pixel kernels.
+
+    Each device is tested: the network's against the model's own answer, the pixel kernels' against NumPy. The
+    last line of each kind says what auto would choose and why.
+
+    \b
+      dior-rt devices
+      dior-rt devices --json
+    """
+    from dior_rt.bundle import default_bundle, read_bundle
+    from dior_rt.devices import survey_network, survey_ops
+    from dior_rt.records import unparse
+
+    surveys = {
+        "network": survey_network(read_bundle(bundle or default_bundle())),
+        "ops": survey_ops(),
+    }
+    if as_json:
+        typer.echo(json.dumps({kind: unparse(survey) for kind, survey in surveys.items()}, indent=2))
+        return
+    for (kind, survey), option in zip(surveys.items(), ("--device", "--ops"), strict=True):
+        typer.echo(f"{kind} ({option})")
+        rows: list[tuple[str, object]] = [
+            (f"  {device.name}", f"{device.description}: {device.problem or 'passes its test'}")
+            for device in survey.devices
+        ]
+        _table([*rows, ("  auto", f"{survey.auto.name}: {survey.auto.reason}")])
+
+
 def info(
     bundle: Annotated[
         Path | None, typer.Argument(metavar="BUNDLE", help="[default: the model that ships with dior-rt]")

@@ -21,7 +21,15 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for body in (pictures.relight, pictures.estimate, pictures.sparsify, about.info, bench.bench, convert.export):
+for body in (
+    pictures.relight,
+    pictures.estimate,
+    pictures.sparsify,
+    about.devices,
+    about.info,
+    bench.bench,
+    convert.export,
+):
     app.command()(body)
 
 

@@ -198,6 +198,26 @@ def test_info(mini_bundle: Path, capfd) -> None:
     assert report["family"] == "mini" and report["steps"] == 4
 
 
+def test_devices_names_what_the_options_take(mini_bundle: Path, folder: Path, capfd) -> None:
+    assert run(["devices", "--bundle", str(mini_bundle), "--json"]) == 0
+    report = json.loads(capfd.readouterr().out)
+    usable = {
+        kind: [device["name"] for device in survey["devices"] if device["problem"] is None]
+        for kind, survey in report.items()
+    }
+    assert "cpu" in usable["network"] and "numpy" in usable["ops"]
+    assert report["network"]["auto"]["name"].split(" ")[0] in usable["network"]
+    assert report["network"]["auto"]["reason"] and report["ops"]["auto"]["reason"]
+    common = ["--bundle", str(mini_bundle), "--steps", "1"]
+    for ops in usable["ops"]:
+        assert run(["relight", "photo.png", "strokes.png", *common, "--ops", ops, "-o", "out.png"]) == 0
+    capfd.readouterr()
+
+    assert run(["devices", "--bundle", str(mini_bundle)]) == 0
+    said = capfd.readouterr().out
+    assert said.count("  auto ") == 2 and all(name in said for names in usable.values() for name in names)
+
+
 # What goes wrong
 
 
