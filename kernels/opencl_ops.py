@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import pyopencl as cl
 
 from dior_rt.kernels import draw
@@ -54,14 +55,13 @@ class OpenCLOps(Ops):
                 session.launch(kernel, size, 1, session.input(flat[band]), *tables, buffer, size)
 
     def _reduce_photo(self, picture: Picture, grid: Grid) -> FloatArray:
-        kernel = self._kernel("sum_rows", picture.dtype, "reduce", LIGHT="DECODE")
-        return self._reduce(kernel, picture, None, grid).light
+        return self._reduce(self._kernel("sum_rows", picture.dtype), picture, None, grid).light
 
     def _reduce_strokes(self, light: Picture, mask: Picture, grid: Grid) -> Strokes:
         # The floats of strokes are linear already.
         decode = "" if light.dtype == np.float32 else "DECODE"
-        masked = {"MASK": SAMPLES[mask.dtype.name], "WHOLE": _whole(mask.dtype), "LIGHT": decode}
-        return self._reduce(self._kernel("sum_rows", light.dtype, "reduce", **masked), light, mask, grid)
+        masked = {"MASK": SAMPLES[mask.dtype.name], "MASK_WHOLE": _whole(mask.dtype), "LIGHT": decode}
+        return self._reduce(self._kernel("sum_rows", light.dtype, **masked), light, mask, grid)
 
     def _reduce(self, sum_rows: cl.Kernel, picture: Picture, mask: Picture | None, grid: Grid) -> Strokes:
         session, (height, width), (rows, columns) = self._session, picture.shape[:2], grid
@@ -74,7 +74,7 @@ class OpenCLOps(Ops):
             session.launch(
                 sum_rows, columns, band.stop - band.start, *pixels, sums, width, columns, band.start
             )
-        mean_columns = session.kernel("mean_columns", "reduce")
+        mean_columns = self._kernel("mean_columns")
         with session.output(result.light) as light, session.output(result.mask) as specified:
             session.launch(mean_columns, columns, rows, sums, light, specified, height, rows, columns)
         return result
@@ -85,7 +85,7 @@ class OpenCLOps(Ops):
         if not strokes:
             return result
         plan, columns = draw.plan(strokes, size), -(-width // draw.TILE)
-        kernel = session.kernel("draw", "draw", TILE=draw.TILE)
+        kernel = self._kernel("draw")
         given = [session.input(array) for array in (plan.segments, plan.lights, plan.first, plan.entries)]
         for band in bands(height, width, BAND):
             with session.output(result.light[band]) as light, session.output(result.mask[band]) as mask:
@@ -100,7 +100,7 @@ class OpenCLOps(Ops):
         given = session.input(lumi), session.input(lattice.keep.astype(np.uint8))
         place = lattice.cell, lattice.oy, lattice.ox
         with session.output(result.light) as light, session.output(result.mask) as mask:
-            kernel = session.kernel("coarsen", "sparsify")
+            kernel = self._kernel("coarsen")
             session.launch(kernel, columns, rows, *given, light, mask, height, width, *place, columns)
         return result
 
@@ -111,8 +111,8 @@ class OpenCLOps(Ops):
         drawn = session.input(row * width + first), session.input(row * width + stop)
         with session.output(result.light) as light, session.output(result.mask) as mask:
             session.clear(mask)
-            session.launch(session.kernel("cover", "sparsify"), row.size, 1, *drawn, mask, row.size)
-            kernel, size = session.kernel("cut", "sparsify"), height * width
+            session.launch(self._kernel("cover"), row.size, 1, *drawn, mask, row.size)
+            kernel, size = self._kernel("cut"), height * width
             session.launch(kernel, size, 1, session.input(lumi), mask, light, size)
         return result
 
@@ -120,8 +120,7 @@ class OpenCLOps(Ops):
         session, (height, width) = self._session, photo.shape[:2]
         rows, columns = nodes.shape[0] - 2, nodes.shape[1] - 2
         result = np.empty(photo.shape, photo.dtype)
-        constants = {"WHOLE": _whole(photo.dtype), "EPSILON": f"{EPSILON}f", "SIGMA": f"{SIGMA}f"}
-        kernel = self._kernel("transfer", photo.dtype, "transfer", **constants)
+        kernel = self._kernel("transfer", photo.dtype)
         given = session.input(nodes), self._decode_table(photo.dtype)
         for band in bands(height, width, BAND):
             with session.output(result[band]) as out:
@@ -130,13 +129,19 @@ class OpenCLOps(Ops):
                 session.launch(kernel, columns, count, session.input(photo[band]), *given, out, *place)
         return result
 
-    def _kernel(self, name: str, dtype: np.dtype, source: str = "", **defines: object) -> cl.Kernel:
-        """A kernel for samples of that dtype, from curve.cl and `source`."""
-        curve = {"SAMPLE": SAMPLES[dtype.name], "TOP": 0}
-        if dtype != np.float32:
-            table = encode_table(dtype)
-            curve |= {"TOP": np.iinfo(dtype).max, "SHIFT": table.shift, "FLOOR": f"{table.floor:.9g}f"}
-        return self._session.kernel(name, f"curve {source}", **curve, **defines)
+    def _kernel(self, name: str, dtype: npt.DTypeLike = np.uint8, **defines: str) -> cl.Kernel:
+        """A kernel for samples of that dtype."""
+        kind = np.dtype(dtype)
+        curve = {"SAMPLE": SAMPLES[kind.name], "WHOLE": _whole(kind), "TOP": "0"}
+        if kind != np.float32:
+            table = encode_table(kind)
+            curve |= {
+                "TOP": f"{np.iinfo(kind).max}",
+                "SHIFT": f"{table.shift}",
+                "FLOOR": f"{table.floor:.9g}f",
+            }
+        constants = {"EPSILON": f"{EPSILON}f", "SIGMA": f"{SIGMA}f", "TILE": f"{draw.TILE}"}
+        return self._session.kernel(name, **curve, **constants, **defines)
 
     def _decode_table(self, dtype: np.dtype) -> cl.Buffer | None:
         return None if dtype == np.float32 else self._session.constant(decode_table(dtype))

@@ -1,4 +1,6 @@
-/* Exact area means: along the rows first, then down the columns of what that left. sum_rows is built after curve.cl.
+/* Exact area means: along the rows first, then down the columns of what that left. Built after curve.cl. With MASK, the
+ * type of a mask whose MASK_WHOLE stands for 1, and LIGHT, how the light's samples are decoded, it is sum_rows of
+ * strokes.
  *
  * Cell j of `cells` over `pixels` pixels spans j * pixels / cells .. (j + 1) * pixels / cells. Its ends are computed as
  * integers, in units of 1 / cells of a pixel: what a cell does not touch weighs exactly nothing.
@@ -18,16 +20,15 @@ inline Span span_of(int j, int pixels, int cells) {
   return span;
 }
 
-#ifdef SAMPLE
 #ifdef MASK
 /* light * mask and mask; what the mask leaves unspecified is not looked at. */
-#define PIXEL(i) specified(picture + 3 * (i), table, (float)mask[i] / WHOLE)
+#define PIXEL(i) specified(picture + 3 * (i), table, (float)mask[i] / MASK_WHOLE)
 inline float4 specified(__global const SAMPLE *pixel, __global const float *table, float weight) {
   if (!(weight > 0.0f)) return (float4)(0.0f);
   return weight * (float4)(LIGHT(pixel[0]), LIGHT(pixel[1]), LIGHT(pixel[2]), 1.0f);
 }
 #else
-#define PIXEL(i) (float4)(LIGHT(picture[3 * (i)]), LIGHT(picture[3 * (i) + 1]), LIGHT(picture[3 * (i) + 2]), 1.0f)
+#define PIXEL(i) (float4)(DECODE(picture[3 * (i)]), DECODE(picture[3 * (i) + 1]), DECODE(picture[3 * (i) + 2]), 1.0f)
 #endif
 
 /* Item (k, y): row y of a band whose first row in the picture is `top`, summed over each of the cells k * run .. */
@@ -51,7 +52,6 @@ __kernel void sum_rows(__global const SAMPLE *restrict picture, __global const f
     sums[(size_t)(top + y) * columns + j] = total + other;
   }
 }
-#endif
 
 /* Item (k, i): cells k * run .. of row i: the sum over the cell's rows divided by its fourth component, which is the
  * area, or the weight of the mask. */
