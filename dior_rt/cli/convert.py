@@ -29,8 +29,13 @@ def export(
     weights: Annotated[
         Precision, typer.Option("--weights", "--precision", help="How the weights are stored.")
     ] = "fp16",
-    steps: Annotated[
-        int | None, typer.Option(min=1, max=1000, help="Qwen: steps of the bundle [40].")
+    steps: Annotated[int, typer.Option(min=1, max=1000, help="The steps that the bundle takes.")] = 40,
+    guidance: Annotated[
+        float | None, typer.Option(min=0, help="A checkpoint of training: its own default guidance [1].")
+    ] = None,
+    noise_scale: Annotated[
+        float | None,
+        typer.Option(min=0, help="A checkpoint of training: how strong its starting noise is [1]."),
     ] = None,
     few_steps: Annotated[
         int | None,
@@ -60,19 +65,21 @@ def export(
     written. Needs pip install 'dior-rt[export]', or for Qwen 'dior-rt[qwen]'.
 
     \b
-      dior-rt export runs/mini/step-9000 --lora runs/mini-lora -o bundles/mini
+      dior-rt export runs/mini --lora runs/mini-lora/lora --guidance 1.25 -o bundles/mini
       dior-rt export Qwen-Image-Edit-2511 --lora dior.safetensors --weights int8 -o bundles/qwen
       dior-rt export Qwen-Image-Edit-2511 --lora dior.safetensors --lora lightning.safetensors:0.9 \\
           --few-steps 8 -o bundles/qwen-fast
     """
     if (source / "model_index.json").is_file():
+        if guidance is not None or noise_scale is not None:
+            raise InputError(
+                "Qwen-Image-Edit has its own guidance and noise; those options are for training's."
+            )
         with needs_extra("qwen", command="export"):
             from dior_rt.export.qwen.bundle import Recipe, export_qwen
             from dior_rt.export.qwen.lora import Lora
 
-            recipe = Recipe(
-                precision=weights, steps=steps or 40, free_steps=free_steps, prompt_cache=prompt_cache
-            )
+            recipe = Recipe(precision=weights, steps=steps, free_steps=free_steps, prompt_cache=prompt_cache)
             bundle = export_qwen(
                 source,
                 out,
@@ -83,16 +90,25 @@ def export(
                 progress=_show,
             )
     else:
-        if steps or few_steps or free_steps or prompt_cache or transformer or weights in ("int8", "int4"):
+        if few_steps or free_steps or prompt_cache or transformer or weights in ("int8", "int4"):
             raise InputError(f"{source} is no Qwen-Image-Edit, and these options are for that.")
         if len(lora) > 1:
             raise InputError("A checkpoint of training takes one LoRA.")
         with needs_extra("export"):
-            from dior_rt.export import export_checkpoint
+            from dior_rt.export.mini import Recipe as MiniRecipe
+            from dior_rt.export.mini import export_checkpoint
 
-            merged = Path(lora[0]) if lora else None
             bundle = export_checkpoint(
-                source, out, lora=merged, weights="fp32" if weights == "fp32" else "fp16", overwrite=overwrite
+                source,
+                out,
+                lora=Path(lora[0]) if lora else None,
+                recipe=MiniRecipe(
+                    steps=steps,
+                    guidance=1.0 if guidance is None else guidance,
+                    noise_scale=1.0 if noise_scale is None else noise_scale,
+                ),
+                weights="fp32" if weights == "fp32" else "fp16",
+                overwrite=overwrite,
             )
     rows = [(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()]
     width = max(len(name) for name, _ in rows)
