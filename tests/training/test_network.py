@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from dior_rt.errors import InputError
@@ -112,10 +113,8 @@ def test_positions_enter_attention_by_their_distance_alone() -> None:
     rows, columns, size = 6, 7, 16
     turns = rotations(rows, columns, size, torch.device("cpu"))
     q, k = torch.randn(2, 1, 1, 1, size, generator=torch.Generator().manual_seed(0))
-    at = [
-        rotate(part.expand(1, 1, rows * columns, size), turns)[0, 0].unflatten(0, (rows, columns))
-        for part in (q, k)
-    ]
+    everywhere = [rotate(part.expand(1, 1, rows * columns, size), turns) for part in (q, k)]
+    at = [part[0, 0].unflatten(0, (rows, columns)) for part in everywhere]
     pairs = [((0, 0), (2, 3)), ((3, 2), (5, 5)), ((1, 3), (3, 6))]
     products = [float(at[0][one] @ at[1][other]) for one, other in pairs]
     assert products == pytest.approx([products[0]] * 3, abs=1e-4)
@@ -135,12 +134,10 @@ def test_relit_light_stays_physical(awake) -> None:
 
 
 def test_colour_is_the_kernels_colour() -> None:
-    linear = np.linspace(0, 1, 4097, dtype=np.float32)
+    values = torch.linspace(0, 1, 4097)
     ops = NumpyOps()
-    np.testing.assert_allclose(
-        linear_to_srgb(torch.from_numpy(linear)), ops.encode_srgb(linear, np.float32), atol=2e-6
-    )
-    np.testing.assert_allclose(srgb_to_linear(torch.from_numpy(linear)), ops.decode_srgb(linear), atol=2e-6)
+    np.testing.assert_allclose(linear_to_srgb(values), ops.encode_srgb(values.numpy(), np.float32), atol=2e-6)
+    np.testing.assert_allclose(srgb_to_linear(values), ops.decode_srgb(values.numpy()), atol=2e-6)
 
 
 def test_light_s_code_is_the_runtime_s() -> None:
@@ -172,8 +169,6 @@ def test_a_network_survives_the_disk(awake, tmp_path) -> None:
 def test_half_precision_is_read_as_single(awake, tmp_path) -> None:
     path, half = tmp_path / "model.safetensors", tmp_path / "half.safetensors"
     save_network(awake, path)
-    from safetensors import safe_open
-
     with safe_open(path, "pt") as file:
         header = file.metadata()
     save_file({name: weight.half() for name, weight in load_file(path).items()}, half, header)

@@ -45,19 +45,23 @@ def lumi(source: Source, things=(WALL,), size: int = SIZE, samples: int = 256) -
     return lumi_map(Stage.load(tuple(things)), CAMERA, source, size, samples)
 
 
+def agree(got: np.ndarray, expected: np.ndarray) -> None:
+    """In every pixel but for the noise of sampling, and on the whole closely."""
+    ratio = got / np.broadcast_to(expected, got.shape)
+    assert np.abs(ratio - 1).max() < 0.15 and abs(ratio.mean() - 1) < 0.01
+
+
 def sphere(at, radius: float) -> Source:
     return Source("sphere", np.array(at), np.zeros(3), radius)
 
 
 @pytest.mark.parametrize(
-    ("at", "radius"), [((2.0, 0.7, 1.5), 0.05), ((0.0, 0.0, 8.0), 0.5), ((-2, 1, 2), 1.2)]
+    ("at", "radius"), [((2.0, 0.7, 1.5), 0.05), ((0.0, 0.0, 8.0), 0.5), ((-2.0, 1.0, 2.0), 1.2)]
 )
 def test_a_sphere_lights_by_the_cosine_and_the_inverse_square(at, radius) -> None:
-    distance, cosine = to_source(at_wall(SIZE), np.array(at, float))
-    expected = (radius / distance) ** 2 * cosine
-    np.testing.assert_allclose(
-        lumi(sphere(np.array(at, float), radius)), expected[..., None] + np.zeros(3), rtol=0.03
-    )
+    distance, cosine = to_source(at_wall(SIZE), np.array(at))
+    expected = ((radius / distance) ** 2 * cosine)[..., None]
+    agree(lumi(sphere(at, radius)), expected)
 
 
 def test_a_spot_lights_like_a_point_inside_its_beam_and_nowhere_outside() -> None:
@@ -95,7 +99,7 @@ def test_a_panel_lights_by_its_form_factor() -> None:
         [source.at + source.size * (a * left + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     )
     expected = np.array([[lambert(point, corners) for point in row] for row in at_wall(SIZE)])
-    np.testing.assert_allclose(lumi(source), expected[..., None] + np.zeros(3), rtol=0.05)
+    agree(lumi(source), expected[..., None])
 
 
 def test_the_dome_over_an_open_wall_is_its_own_radiance() -> None:
@@ -148,8 +152,7 @@ def test_maps_of_several_sources_add_and_follow_strength_and_colour() -> None:
     colors = np.float32([[3, 1.5, 0]]), np.float32([[0, 0.5, 4]])
     together = render_all([one, other], [color[0] for color in colors], 1024)
     expected = lumi(one) * colors[0] + lumi(other) * colors[1]
-    np.testing.assert_allclose(together, expected, rtol=0.1)
-    assert abs(together.mean() / expected.mean() - 1) < 0.01
+    agree(together, expected)
 
 
 def test_strength_and_colour_scale_a_map_exactly() -> None:
@@ -260,5 +263,5 @@ def test_what_was_half_written_is_rendered_again_and_the_same(renders, tmp_path,
 def test_a_damaged_render_is_named(renders, tmp_path, damage) -> None:
     path = tmp_path / "007000000-0.npz"
     path.write_bytes(damage((renders / path.name).read_bytes()))
-    with pytest.raises(InputError, match="007000000-0.npz is no render"):
+    with pytest.raises(InputError, match=r"007000000-0\.npz is no render"):
         load_views(tmp_path)
