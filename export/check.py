@@ -9,18 +9,18 @@ from typing import Final
 
 import numpy as np
 import torch
-from dior_rt.kernels import Strokes
 
 from dior_rt.engine import Engine, Feeds
 from dior_rt.errors import DiorError
 from dior_rt.family import Mode, mini
+from dior_rt.grid import GridRule
+from dior_rt.kernels import Strokes
 from dior_rt.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 
 EVALUATION_BAR: Final = 1e-4  # largest error of one evaluation, relative to the output's largest value
 SAMPLING_BAR: Final = 60.0  # dB, after all steps
 
 SIGMAS: Final = (1.0, 0.9, 0.5, 0.1, 1e-3)
-SIZES: Final = ((64, 64), (52, 80), (4, 256), (4, 4))
 SEEDS: Final = (0, 1, 2)
 # How many units of the data variable span black to white.
 SPAN: Final[dict[Mode, float]] = {"relight": 4.0, "estimate": 2.0}
@@ -32,12 +32,11 @@ class ExportError(DiorError):
     """A checkpoint that cannot be exported, or an export that computes something else than its source."""
 
 
-def check_evaluations(network: torch.nn.Module, engine: Engine) -> float:
-    """The largest relative error of one evaluation, over sigmas, sizes, modes, seeds and hostile inputs."""
+def check_evaluations(network: torch.nn.Module, engine: Engine, grid: GridRule) -> float:
+    """The largest relative error of one evaluation, over sigmas, grids, modes, seeds and hostile inputs."""
     worst = 0.0
-    for feeds in _all_feeds():
-        want, got = evaluate(network, feeds), engine.run(feeds)["velocity"]
-        worst = max(worst, float(np.abs(got - want).max() / np.abs(want).max()))
+    for feeds in _all_feeds(grid):
+        worst = max(worst, relative_error(engine.run(feeds)["velocity"], evaluate(network, feeds)))
     if not worst <= EVALUATION_BAR:
         raise ExportError(
             f"The graph is off by {worst:.2g} of its largest value; {EVALUATION_BAR:g} is allowed."
@@ -45,11 +44,13 @@ def check_evaluations(network: torch.nn.Module, engine: Engine) -> float:
     return worst
 
 
-def check_sampling(network: torch.nn.Module, bind: Bind, sigmas: Array, guidance: float) -> float:
+def check_sampling(
+    network: torch.nn.Module, bind: Bind, grid: GridRule, sigmas: Array, guidance: float
+) -> float:
     """The lowest PSNR, in dB, between whole runs of the runtime's sampler over the graph and over torch."""
     lowest = math.inf
-    for (height, width), mode in product(SIZES[:2], SPAN):
-        condition = random_condition(height, width, mode, seed=height)
+    for size, mode in product((grid.shape(1, 1), grid.shape(2, 3)), SPAN):
+        condition = random_condition(*size, mode, seed=size[0])
         error = _run(bind, condition, sigmas, guidance) - _run(_bind(network), condition, sigmas, guidance)
         mean_square = float(np.mean(np.square(error / SPAN[mode], dtype=np.float64)))
         lowest = min(lowest, -10 * math.log10(max(mean_square, 1e-20)))
@@ -61,9 +62,18 @@ def check_sampling(network: torch.nn.Module, bind: Bind, sigmas: Array, guidance
 
 
 def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:
-    """The network's velocity in torch, as an array."""
+    """The network's velocity in torch, as an array; ExportError where it is not finite."""
     with torch.inference_mode():
-        return network(**{name: torch.from_numpy(array) for name, array in feeds.items()}).numpy()
+        velocity = network(**{name: torch.from_numpy(array) for name, array in feeds.items()}).numpy()
+    if not np.isfinite(velocity).all():
+        raise ExportError("The network computes what is no number; its weights are broken.")
+    return velocity
+
+
+def relative_error(got: Array, want: Array) -> float:
+    """The largest difference in a batch, relative to the largest value of its own row."""
+    rows = tuple(range(1, want.ndim))
+    return float((np.abs(got - want).max(rows) / np.maximum(np.abs(want).max(rows), 1e-6)).max())
 
 
 def random_condition(height: int, width: int, mode: Mode, seed: int) -> Condition:
@@ -84,10 +94,11 @@ def random_feeds(height: int, width: int, seed: int) -> Feeds:
     return {"x": draw_noise(seed, condition["photo"].shape), "sigma": sigma, **condition}
 
 
-def _all_feeds() -> Iterator[Feeds]:
-    for (height, width), seed in product(SIZES, SEEDS):
-        yield random_feeds(height, width, seed)
-    usual = random_feeds(16, 16, seed=0)
+def _all_feeds(grid: GridRule) -> Iterator[Feeds]:
+    smallest = grid.multiple, grid.multiple
+    for size, seed in product((grid.shape(1, 1), grid.shape(2, 3), grid.shape(1, 10**6), smallest), SEEDS):
+        yield random_feeds(*size, seed)
+    usual = random_feeds(*grid.shape(3, 2), seed=0)
     black, bare = np.zeros_like(usual["photo"]), np.zeros_like(usual["mask"])
     yield {**usual, "mask": bare, "light": black}
     yield {**usual, "mask": bare + 1}

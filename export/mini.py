@@ -7,7 +7,7 @@ import logging
 import tempfile
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, Literal
@@ -16,20 +16,31 @@ import numpy as np
 import onnx
 import onnx_ir
 import torch
-from dior_rt.export.check import ExportError, check_evaluations, check_sampling, evaluate, random_feeds
 from onnx import TensorProto, helper, numpy_helper
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 from torch.export import Dim
 
 from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
 from dior_rt.engine import Engine
+from dior_rt.export.check import (
+    ExportError,
+    check_evaluations,
+    check_sampling,
+    evaluate,
+    random_feeds,
+    relative_error,
+)
+from dior_rt.export.lora import merge_lora
 from dior_rt.family import mini
 from dior_rt.files import reason
 from dior_rt.grid import GridRule
 from dior_rt.schedule import ShiftSchedule
+from dior_rt.training.network import load_network
 
 Weights = Literal["fp16", "fp32"]
 
+CHECKPOINT: Final = "model.safetensors"
+LORA: Final = "lora"
 GRAPH: Final = "model.onnx"
 PROBE: Final = "probe.npz"
 LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothing
@@ -39,12 +50,39 @@ LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothin
 class Recipe:
     """How a network wants to be run; the fields are the manifest's."""
 
-    name: str
-    grid: GridRule
-    schedule: ShiftSchedule
-    steps: int
-    guidance: float
-    noise_scale: float
+    name: str = "mini"
+    grid: GridRule = field(default_factory=GridRule)
+    schedule: ShiftSchedule = field(default_factory=lambda: ShiftSchedule(8.0))
+    steps: int = 40
+    guidance: float = 1.0
+    noise_scale: float = 1.0
+
+
+USUAL: Final = Recipe()
+
+
+def export_checkpoint(
+    checkpoint: Path,
+    out: Path,
+    *,
+    lora: Path | None = None,
+    recipe: Recipe = USUAL,
+    weights: Weights = "fp16",
+    overwrite: bool = False,
+) -> Bundle:
+    """Write the bundle of a checkpoint at `out`.
+
+    checkpoint: a folder that training wrote, or its model.safetensors. lora: a folder of peft's to be
+    merged; of a checkpoint's folder it is lora/, where there is one. recipe: its grid's multiple is set to
+    the network's patch. Raises InputError for files that cannot be used, and what `export_network` raises.
+    """
+    check_target(out, overwrite)
+    if checkpoint.is_dir():
+        checkpoint, lora = checkpoint / CHECKPOINT, lora or _present(checkpoint / LORA)
+    network = load_network(checkpoint)
+    recipe = replace(recipe, grid=replace(recipe.grid, multiple=network.config.patch))
+    merged = merge_lora(network, lora) if lora else network
+    return export_network(merged, recipe, out, weights=weights, overwrite=overwrite)
 
 
 def export_network(
@@ -67,9 +105,11 @@ def export_network(
             store_as_half(graph)
         onnx.checker.check_model(graph, full_check=True)
         engine = Engine(graph)
-        parity["evaluation"] = check_evaluations(network, engine)
+        parity["evaluation"] = check_evaluations(network, engine, recipe.grid)
         sigmas = recipe.schedule.sigmas(recipe.steps)
-        parity["sampling_db"] = check_sampling(network, partial(mini.bind, engine), sigmas, recipe.guidance)
+        parity["sampling_db"] = check_sampling(
+            network, partial(mini.bind, engine), recipe.grid, sigmas, recipe.guidance
+        )
         save_probe(network, probe, recipe.grid)
         manifest = describe(recipe, engine, weights, parity)
         return write_bundle(out, manifest, {GRAPH: graph, PROBE: probe}, overwrite=overwrite)
@@ -106,15 +146,14 @@ def convert(network: torch.nn.Module, path: Path, multiple: int) -> None:
 def round_to_half(network: torch.nn.Module, grid: GridRule) -> float:
     """Round the large weights to what float16 can hold, in place.
 
-    Returns what that costs: the largest change of an evaluation, relative to its largest value.
+    Returns what that costs: the largest change of one evaluation, relative to its largest value.
     """
     feeds = random_feeds(*grid.shape(1, 1), seed=0)
     before = evaluate(network, feeds)
     for weight in network.parameters():
         if weight.numel() >= LARGE:
             weight.data = weight.data.half().float()
-    after = evaluate(network, feeds)
-    return float(np.abs(after - before).max() / np.abs(before).max())
+    return relative_error(evaluate(network, feeds), before)
 
 
 def store_as_half(path: Path) -> None:
@@ -159,6 +198,10 @@ def describe(recipe: Recipe, engine: Engine, weights: Weights, parity: dict[str,
         parity=parity,
         settings={},
     )
+
+
+def _present(folder: Path) -> Path | None:
+    return folder if folder.is_dir() else None
 
 
 @contextlib.contextmanager
