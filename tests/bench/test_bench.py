@@ -21,6 +21,7 @@ from dior_rt.bench.run import measure
 from dior_rt.bench.scene import write_scene
 from dior_rt.bench.tables import as_markdown, compare
 from dior_rt.bundle import Bundle, read_bundle
+from dior_rt.cli import run
 from dior_rt.errors import DeviceError, InputError
 from dior_rt.pictures import read_photo
 from dior_rt.strokes import read_strokes
@@ -187,7 +188,7 @@ def test_the_machine_knows_itself() -> None:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not say")
 def test_the_peak_of_memory_is_the_process_s_own() -> None:
-    """Linux' getrusage gives a child the peak of its parent; so the parent is made large, the child is not."""
+    """Linux' getrusage gives a child its parent's peak; so the parent is made large, the child is not."""
     child = """
 import sys
 from dior_rt.bench.worker import peak_memory
@@ -315,7 +316,7 @@ def test_compare_from_the_command_line(quick, bench, mini_bundle: Path) -> None:
     assert "| new / old " in said.stdout and "not the same" not in said.stdout
 
 
-def test_what_cannot_be_done_is_one_sentence(bench, quick, mini_bundle: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_done_is_one_sentence(mini_bundle: Path, tmp_path: Path, capfd) -> None:
     (tmp_path / "broken.json").write_text('{"format": 1}')
     photo = tmp_path / "photo.png"
     Image.new("RGB", (30, 20)).save(photo)
@@ -330,14 +331,12 @@ def test_what_cannot_be_done_is_one_sentence(bench, quick, mini_bundle: Path, tm
         "does not exist": ["--json", tmp_path / "missing" / "bench.json"],
     }
     for words, options in cases.items():
-        said = bench("--bundle", mini_bundle, *options)
-        assert said.returncode == 2, words
-        assert words in said.stderr and said.stderr.count("\n") == 1 and said.stdout == ""
+        assert run(["bench", "--bundle", str(mini_bundle), *map(str, options)]) == 2, words
+        said = capfd.readouterr()
+        assert words in said.err and said.err.count("\n") == 1 and said.out == ""
 
 
 def test_without_matplotlib_the_plot_names_the_extra(mini_bundle: Path, monkeypatch, capfd) -> None:
-    from dior_rt.cli import run
-
     monkeypatch.delitem(sys.modules, "dior_rt.bench.plot", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from dior_rt.kernels import Strokes
 
 from dior_rt.bundle import read_bundle
 from dior_rt.errors import BundleError
 from dior_rt.family.mini import Mini, encode, null
+from dior_rt.kernels import Strokes
 from dior_rt.sampler import draw_noise
 from dior_rt.schedule import DynamicShiftSchedule
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from dior_rt.kernels import Strokes
 from PIL import Image
 
 from dior_rt.errors import InputError
+from dior_rt.kernels import Strokes
 from dior_rt.pixels import check_same_shape, like_photo, read_pixels, read_strokes
 
 RGB = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)

@@ -7,12 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from dior_rt.export.mini import round_to_half
-from dior_rt.kernels import NumpyOps, Strokes
 from PIL import Image
 
 from dior_rt.bundle import read_bundle, write_bundle
 from dior_rt.errors import BundleError, Cancelled, DeviceError, InputError
+from dior_rt.export.mini import round_to_half
+from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.relight import Relighter
 
 
