@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dior_rt.kernels.devices import Device, list_devices, open_device, open_ops
+from dior_rt.kernels.devices import Device, list_devices, open_device, open_ops, prepare_caches
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
 from dior_rt.kernels.selftest import self_test
@@ -35,6 +35,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     # pyopencl is loaded only by those who ask for OpenCL.
     if name == "OpenCLOps":
+        prepare_caches()
         from dior_rt.kernels.opencl_ops import OpenCLOps
 
         return OpenCLOps

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
+import os
+import shutil
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from dior_rt.kernels.numpy_ops import NumpyOps
@@ -24,14 +29,15 @@ class Device:
 
 def list_devices() -> list[Device]:
     """Every OpenCL device, in the platforms' order. Raises KernelError where there is no OpenCL at all."""
+    prepare_caches()
     try:
         import pyopencl as cl
     except ImportError as error:
-        raise KernelError(f"pyopencl cannot be loaded ({error}).") from error
+        raise KernelError(f"pyopencl cannot be loaded ({error})") from error
     try:
         handles = [device for platform in cl.get_platforms() for device in _devices(platform)]
     except cl.Error as error:
-        raise KernelError(f"no OpenCL platform was found ({error}).") from error
+        raise KernelError(f"there is no OpenCL platform ({error})") from error
     types = {cl.device_type.GPU: "gpu", cl.device_type.CPU: "cpu", cl.device_type.ACCELERATOR: "accelerator"}
     return [
         Device(
@@ -43,6 +49,26 @@ def list_devices() -> list[Device]:
         )
         for index, handle in enumerate(handles)
     ]
+
+
+def prepare_caches() -> None:
+    """Have PoCL and pyopencl keep what they compile in a folder that is writable and nobody else's.
+
+    PoCL would use ~/.cache/pocl/kcache, have no device at all where that cannot be written, and, without a
+    HOME, load code from /tmp/pocl, which anyone may have put there. Its last resort here is a temporary folder of
+    this process; pyopencl's is to cache nothing. To be called before pyopencl is imported.
+    """
+    try:
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home, "pocl", "kcache")
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (OSError, RuntimeError):
+        folder = Path(tempfile.mkdtemp(prefix="pocl-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
+    os.environ.setdefault("POCL_CACHE_DIR", str(folder))
 
 
 def open_ops(name: str = "auto") -> Ops:
@@ -58,12 +84,12 @@ def open_ops(name: str = "auto") -> Ops:
         return _choose_best()
     backend, _, which = name.partition(":")
     if backend != "opencl":
-        raise KernelError(f"there are no pixel kernels called {name!r}: use auto, numpy or opencl[:<which>].")
+        raise KernelError(f"there are no pixel kernels called {name!r}: use auto, numpy or opencl[:<which>]")
     devices = by_preference(list_devices())
     if which:
         devices = [device for device in devices if _answers_to(device, which)]
     if not devices:
-        raise KernelError(f"no OpenCL device answers to {name!r}.")
+        raise KernelError(f"no OpenCL device answers to {name!r}")
     return open_device(devices[0])
 
 
@@ -83,22 +109,21 @@ def by_preference(devices: list[Device]) -> list[Device]:
 
 
 def _choose_best() -> Ops:
-    failures = []
     try:
-        for device in by_preference(list_devices()):
-            try:
-                ops = open_device(device)
-            except KernelError as error:
-                failures.append(str(error))
-                continue
-            ops.reason = " ".join(
-                [*failures, f"it is the first OpenCL {device.type} that passes its self-test"]
-            )
-            return ops
+        devices = by_preference(list_devices())
+        problems = [] if devices else ["no OpenCL platform has a device"]
     except KernelError as error:
-        failures.append(str(error))
+        devices, problems = [], [str(error)]
+    for device in devices:
+        try:
+            ops = open_device(device)
+        except KernelError as error:
+            problems.append(str(error))
+            continue
+        ops.reason = "; ".join([*problems, f"it is the first OpenCL {device.type} that passes its self-test"])
+        return ops
     ops = NumpyOps()
-    ops.reason = " ".join([*failures, "no OpenCL device is usable, so the pixel kernels run on NumPy"])
+    ops.reason = "; ".join([*problems, "so the pixel kernels run on NumPy"])
     return ops
 
 

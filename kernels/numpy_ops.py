@@ -12,6 +12,9 @@ from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA, rough_reciprocal
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
+#: Pixels in a band: what is worked on at a time stays in the processor's cache.
+BAND = 1 << 16
+
 
 class NumpyOps(Ops):
     """Vectorised NumPy, in bands of rows."""
@@ -37,7 +40,7 @@ class NumpyOps(Ops):
         height, width = picture.shape[:2]
         down, across = area_weights(height, grid[0]), area_weights(width, grid[1])
         total = np.zeros((grid[0], width * 3), np.float32)
-        for rows in bands(height, width):
+        for rows in bands(height, width, BAND):
             cells = down[:, rows].any(1)
             total[cells] += down[cells, rows] @ self._decode(picture[rows]).reshape(-1, width * 3)
         return across @ total.reshape(grid[0], width, 3)
@@ -46,7 +49,7 @@ class NumpyOps(Ops):
         height, width = mask.shape
         down, across = area_weights(height, grid[0]), area_weights(width, grid[1])
         total = np.zeros((grid[0], width * 4), np.float32)
-        for rows in bands(height, width):
+        for rows in bands(height, width, BAND):
             cells = down[:, rows].any(1)
             weighted = _weighted(light[rows], mask[rows])
             total[cells] += down[cells, rows] @ weighted.reshape(-1, width * 4)
@@ -58,7 +61,7 @@ class NumpyOps(Ops):
     def _draw_strokes(self, strokes: list[Stroke], size: Grid) -> Strokes:
         height, width = size
         light, mask = np.zeros((height, width, 3), np.float32), np.zeros(size, np.float32)
-        for rows in bands(height, width):
+        for rows in bands(height, width, BAND):
             for stroke in strokes:
                 _lay_over(light[rows], mask[rows], stroke, rows.start)
         np.divide(light, mask[..., None], out=light, where=mask[..., None] > 0)
@@ -89,7 +92,7 @@ class NumpyOps(Ops):
         row, down = spline_taps(height, nodes.shape[0] - 2)
         column, across = spline_taps(width, nodes.shape[1] - 2)
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
-        for rows in bands(height, width):
+        for rows in bands(height, width, BAND):
             linear = self._decode(photo[rows])
             lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1)
             total = np.zeros((*lightness.shape, 4), np.float32)

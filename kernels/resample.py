@@ -8,12 +8,9 @@ import numpy as np
 
 from dior_rt.kernels.types import FloatArray
 
-#: Pixels in a band by default, so that memory stays bounded however large the picture.
-BAND = 1 << 18
 
-
-def bands(height: int, width: int, pixels: int = BAND) -> Iterator[slice]:
-    """Slices of rows, in order, of about `pixels` pixels each and at least one row."""
+def bands(height: int, width: int, pixels: int) -> Iterator[slice]:
+    """Slices of rows, in order, of about `pixels` pixels each and at least one row: memory stays bounded."""
     rows = max(1, pixels // width)
     for top in range(0, height, rows):
         yield slice(top, min(height, top + rows))

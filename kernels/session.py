@@ -36,7 +36,7 @@ class Session:
             self._queue = cl.CommandQueue(self._context)
             self._shares_memory = bool(device.handle.host_unified_memory)
         except cl.Error as error:
-            raise KernelError(f"{self.name} cannot be opened ({error}).") from error
+            raise KernelError(f"{self.name} cannot be opened ({error})") from error
         self._run = CPU_RUN if device.type == "cpu" else 1
         self._lock = threading.Lock()
         self._programs: dict[tuple[str, ...], cl.Program] = {}
@@ -65,8 +65,9 @@ class Session:
         group); a GPU wants many items. None is a null pointer."""
         items = -(-count // self._run), rows
         group = (1, 1) if self._run > 1 else None
-        numbers = [np.int32(arg) if isinstance(arg, int) else arg for arg in (*args, self._run)]
-        kernel(self._queue, items, group, *numbers).wait()
+        for place, arg in enumerate((*args, self._run)):
+            kernel.set_arg(place, np.int32(arg) if isinstance(arg, int) else arg)
+        cl.enqueue_nd_range_kernel(self._queue, kernel, items, group).wait()
 
     def constant(self, array: np.ndarray) -> cl.Buffer:
         """A copy of an array that lives as long as the session, once for each array."""
