@@ -85,13 +85,12 @@ def fit_lora(
     Resumes and raises like `fit`.
     """
     torch.manual_seed(plan.seed)
-    network = load_network(base)
-    make_folder(out)
-    save_network(network, out / WEIGHTS)
-    adapted = get_peft_model(network, LoraConfig(r=rank, lora_alpha=rank, target_modules=LORA_TARGETS))  # type: ignore[arg-type]
+    lora = LoraConfig(r=rank, lora_alpha=rank, target_modules=LORA_TARGETS)
+    adapted = get_peft_model(load_network(base), lora)  # type: ignore[arg-type]
 
     def save(network: nn.Module) -> None:
         assert isinstance(network, PeftModel)
+        save_network(load_network(base), out / WEIGHTS)
         network.save_pretrained(str(out / LORA), safe_serialization=True)
 
     _run(adapted, renders, out, plan, progress, save)
