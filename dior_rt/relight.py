@@ -145,7 +145,7 @@ class Relighter:
         raster: tuple[int, int],
         intensity: float,
     ) -> Strokes:
-        if isinstance(strokes, list | tuple):
+        if isinstance(strokes, Sequence):
             strokes = self._draw(strokes, size)
         light, mask = read_strokes(strokes)
         if mask.shape != raster:

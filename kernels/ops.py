@@ -103,7 +103,8 @@ class Ops(ABC):
         if mode == "dense":
             return Strokes(lumi.copy(), np.ones(lumi.shape[:2], np.float32))
         if mode == "coarse":
-            return self._coarsen(lumi, draw_lattice(*lumi.shape[:2], seed))
+            height, width = lumi.shape[:2]
+            return self._coarsen(lumi, draw_lattice(height, width, seed))
         return self._cut(lumi, draw_walks(lumi, seed, interest))
 
     def transfer(self, photo: Picture, source: FloatArray, relit: FloatArray) -> Picture:

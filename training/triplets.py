@@ -23,6 +23,7 @@ from dior_rt.errors import InputError
 from dior_rt.family import Mode
 from dior_rt.family.mini import MODES
 from dior_rt.kernels import NumpyOps
+from dior_rt.kernels.ops import Mode as Sparsity
 from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb
 from dior_rt.training.render import View
 
@@ -160,7 +161,8 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
             flat = np.where(inside[..., None], drawn.light[inside].mean(axis=0), 0)
             return flat.astype(np.float32), drawn.mask
     else:
-        mode = ("strokes", "coarse", "dense")[rng.choice(3, p=[0.5, 0.25, 0.25])]
+        modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
+        mode = modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
         drawn = ops.sparsify(sample.target, mode, seed)
     return drawn.light, drawn.mask
 

@@ -108,7 +108,7 @@ class Merged:
         return weight
 
 
-def read_config(path: Path) -> dict[str, object]:
+def read_config(path: Path) -> dict[str, Any]:
     """A JSON object from disk; InputError where there is none."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
