@@ -55,9 +55,8 @@ def prepare_caches() -> None:
     """Have PoCL and pyopencl keep what they compile in a folder that is writable and nobody else's.
 
     PoCL would use ~/.cache/pocl/kcache, have no device at all where that cannot be written, and, without a
-    HOME, load code from /tmp/pocl, which anyone may have put there. Its last resort here is a temporary folder of
-    this process; pyopencl's is to cache nothing. To be called before pyopencl is imported.
-    """
+    HOME, load code from /tmp/pocl, which anyone may have put there. Its last resort here is a temporary
+    folder of this process; pyopencl's is to cache nothing. To be called before pyopencl is imported. """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home, "pocl", "kcache")

@@ -73,7 +73,7 @@ class NumpyOps(Ops):
         column = (np.arange(width) + lattice.ox) // lattice.cell
         pixels = np.float32(np.bincount(row)[:, None, None] * np.bincount(column)[:, None])
         first_rows, first_columns = (np.flatnonzero(np.diff(x, prepend=-1)) for x in (row, column))
-        mean = np.add.reduceat(np.add.reduceat(lumi, first_rows, 0), first_columns, 1) / pixels
+        mean: FloatArray = np.add.reduceat(np.add.reduceat(lumi, first_rows, 0), first_columns, 1) / pixels
         mask = lattice.keep.astype(np.float32)
         return Strokes((mean * mask[..., None])[row[:, None], column], mask[row[:, None], column])
 
