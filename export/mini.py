@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import onnx
@@ -177,7 +177,8 @@ def store_as_half(path: Path) -> None:
 def save_probe(network: torch.nn.Module, path: Path, grid: GridRule) -> None:
     """The bundle's self-test: one small evaluation, and what torch answers."""
     feeds = random_feeds(2 * grid.multiple, 3 * grid.multiple, seed=1)
-    np.savez(path, **feeds, velocity=evaluate(network, feeds))
+    arrays: dict[str, Any] = {**feeds, "velocity": evaluate(network, feeds)}
+    np.savez(path, **arrays)
 
 
 def describe(recipe: Recipe, engine: Engine, weights: Weights, parity: dict[str, float]) -> Manifest:

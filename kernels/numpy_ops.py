@@ -73,7 +73,8 @@ class NumpyOps(Ops):
         column = (np.arange(width) + lattice.ox) // lattice.cell
         pixels = np.float32(np.bincount(row)[:, None, None] * np.bincount(column)[:, None])
         first_rows, first_columns = (np.flatnonzero(np.diff(x, prepend=-1)) for x in (row, column))
-        mean: FloatArray = np.add.reduceat(np.add.reduceat(lumi, first_rows, 0), first_columns, 1) / pixels
+        total = np.add.reduceat(np.add.reduceat(lumi, first_rows, 0), first_columns, 1)
+        mean = (total / pixels).astype(np.float32, copy=False)
         mask = lattice.keep.astype(np.float32)
         return Strokes((mean * mask[..., None])[row[:, None], column], mask[row[:, None], column])
 
