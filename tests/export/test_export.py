@@ -13,7 +13,6 @@ from onnx import TensorProto, helper, numpy_helper
 from peft import LoraConfig, get_peft_model
 from safetensors.torch import save_file
 
-from dior_rt.bundle import read_bundle
 from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError, InputError
 from dior_rt.export import mini as export
@@ -32,18 +31,13 @@ from dior_rt.training.network import save_network
 
 
 @pytest.fixture(scope="module")
-def exported(mini_bundle):
-    return read_bundle(mini_bundle)
-
-
-@pytest.fixture(scope="module")
-def graph(mini_bundle):
-    return onnx.load(mini_bundle / "model.onnx")
+def graph(exported):
+    return onnx.load(exported.path("velocity"))
 
 
 @pytest.fixture
 def rounded(network, recipe):
-    """The network as `mini_bundle` holds it."""
+    """The network as `exported` holds it."""
     round_to_half(network, recipe.grid)
     return network
 

@@ -99,7 +99,7 @@ def test_sides_must_be_multiples_where_the_graph_says_so(mini_bundle):
     with np.load(mini_bundle / "probe.npz") as probe:
         given = {tensor.name: probe[tensor.name] for tensor in engine.inputs}
     cut = {name: array[..., :-1] if array.ndim == 4 else array for name, array in given.items()}
-    with pytest.raises(InputError, match=r"4\*columns"):
+    with pytest.raises(InputError, match=r"\d\*columns"):
         engine.run(cut)
 
 

@@ -20,14 +20,14 @@ def mini(mini_bundle):
 
 @pytest.fixture
 def photo():
-    return np.random.default_rng(0).random((8, 12, 3), dtype=np.float32)
+    return np.random.default_rng(0).random((16, 24, 3), dtype=np.float32)
 
 
 @pytest.fixture
 def strokes():
     rng = np.random.default_rng(1)
     return Strokes(
-        rng.random((8, 12, 3), dtype=np.float32) * 3, (rng.random((8, 12)) < 0.3).astype(np.float32)
+        rng.random((16, 24, 3), dtype=np.float32) * 3, (rng.random((16, 24)) < 0.3).astype(np.float32)
     )
 
 
@@ -77,7 +77,7 @@ def test_lumi_is_decoded_by_the_inverse_of_its_encoding(mini, photo):
 
 
 def test_velocity_is_guided_between_the_two_branches(mini, photo, strokes):
-    condition, x = encode(photo, strokes, "relight"), draw_noise(0, (1, 3, 8, 12))
+    condition, x = encode(photo, strokes, "relight"), draw_noise(0, (1, 3, 16, 24))
     sigmas = mini.sigmas(4, condition)
     v_null, v_cond, v = (mini.velocity(condition, sigmas, scale)(x, 0.7) for scale in (0.0, 1.0, 3.0))
     assert np.abs(v_cond - v_null).max() > 1e-3
@@ -85,7 +85,7 @@ def test_velocity_is_guided_between_the_two_branches(mini, photo, strokes):
 
 
 def test_the_graph_sees_strokes_and_mode(mini, photo, strokes):
-    x = draw_noise(0, (1, 3, 8, 12))
+    x = draw_noise(0, (1, 3, 16, 24))
     seen = [
         mini.velocity(condition, mini.sigmas(4, condition), 1.0)(x, 0.7)
         for condition in (

@@ -1,19 +1,20 @@
-"""The whole way of a picture, on a small mini with random weights."""
+"""The whole way of a picture, with the weights that ship on a smaller grid."""
 
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from dior_rt.bundle import read_bundle, write_bundle
 from dior_rt.errors import BundleError, Cancelled, DeviceError, InputError
-from dior_rt.export.mini import round_to_half
 from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.relight import Relighter
+
+CHECKPOINT = Path(__file__).parents[2] / "training" / "checkpoints" / "mini"
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +35,15 @@ def drawing(height=60, width=90, light=(1.5, 0.8, 0.4)):
     return strokes
 
 
-def test_the_result_is_what_torch_and_a_plain_loop_give(relighter, network, recipe):
-    """The same line in torch and NumPy, written out: 4 steps, guidance 2, seed 5."""
-    round_to_half(network, recipe.grid)
+def test_the_result_is_what_torch_and_a_plain_loop_give(relighter):
+    """The same line in torch and NumPy, written out, from the checkpoint: 4 steps, guidance 2, seed 5."""
+    torch = pytest.importorskip("torch")
+    from dior_rt.export.lora import merge_lora
+    from dior_rt.training.network import load_network
+
+    network = merge_lora(load_network(CHECKPOINT / "model.safetensors"), CHECKPOINT / "lora")
     ops, picture, strokes = NumpyOps(), photo(), drawing()
-    grid = recipe.grid.shape(60, 90)
+    grid = relighter.bundle.manifest.grid.shape(60, 90)
     source = ops.reduce_photo(picture, grid)
     srgb = np.where(source <= 0.0031308, 12.92 * source, 1.055 * source ** (1 / 2.4) - 0.055)
     drawn = ops.reduce_strokes(strokes.light, strokes.mask, grid)
@@ -127,9 +132,9 @@ def test_strokes_of_another_size_mean_the_same(relighter):
     assert np.abs(full.astype(int) - half).mean() < np.abs(full.astype(int) - photo()).mean() / 4
 
 
-def test_strokes_on_the_light_grid_are_taken_whatever_its_shape(relighter, recipe):
+def test_strokes_on_the_light_grid_are_taken_whatever_its_shape(relighter):
     picture = photo(40, 1000)
-    rows, columns = recipe.grid.shape(40, 1000)
+    rows, columns = relighter.bundle.manifest.grid.shape(40, 1000)
     assert relighter.relight(picture, drawing(rows, columns)).picture.shape == picture.shape
     with pytest.raises(InputError, match="shapes differ"):
         relighter.relight(picture, drawing(rows, columns // 2))
@@ -191,9 +196,9 @@ def test_every_way_to_compute_the_kernels_gives_the_same_picture(mini_bundle, re
     assert other.ops_reason and other.device_reason
 
 
-def test_an_estimate_is_a_light_map_of_the_grid(relighter, recipe):
+def test_an_estimate_is_a_light_map_of_the_grid(relighter):
     lumi, again = (relighter.estimate(photo(), seed=1) for _ in range(2))
-    assert lumi.shape == (*recipe.grid.shape(60, 90), 3) and lumi.dtype == np.float32
+    assert lumi.shape == (*relighter.bundle.manifest.grid.shape(60, 90), 3) and lumi.dtype == np.float32
     assert np.isfinite(lumi).all() and lumi.min() >= 0 and lumi.max() > 0
     np.testing.assert_array_equal(lumi, again)
     with pytest.raises(Cancelled):

@@ -1,0 +1,60 @@
+"""The model that ships: complete, within its bounds, and it answers to the brush."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dior_rt import Relighter
+from dior_rt.bundle import default_bundle, read_bundle
+from dior_rt.kernels import NumpyOps, Strokes
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+OPS = NumpyOps()
+
+
+@pytest.fixture(scope="module")
+def relighter():
+    return Relighter(device="cpu")
+
+
+@pytest.fixture(scope="module", params=["coffee.jpg", "chelsea.jpg", "astronaut.jpg"])
+def photo(request):
+    return np.asarray(Image.open(EXAMPLES / request.param).convert("RGB"))
+
+
+@pytest.fixture(scope="module")
+def brushed(photo):
+    """A disc in the middle, a fifth of the photo wide."""
+    height, width = photo.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    return np.hypot(y - height / 2, x - width / 2) < min(height, width) / 10
+
+
+def under_the_brush(relighter, photo, brushed, light):
+    """Mean linear RGB under the brush, after light of this colour was drawn there."""
+    strokes = Strokes(np.broadcast_to(np.float32(light), photo.shape), brushed.astype(np.float32))
+    return OPS.decode_srgb(relighter.relight(photo, strokes, seed=1).picture)[brushed].mean(0)
+
+
+def test_it_is_whole_small_and_measured():
+    bundle = read_bundle(default_bundle())
+    size = sum(path.stat().st_size for path in bundle.folder.iterdir())
+    assert size <= 32e6
+    assert bundle.manifest.family == "mini" and bundle.manifest.licence == "Apache-2.0"
+    assert bundle.manifest.parity["evaluation"] <= 1e-4
+    assert bundle.manifest.parity["sampling_db"] >= 60
+
+
+def test_bright_strokes_brighten_and_dark_ones_darken(relighter, photo, brushed):
+    before = OPS.decode_srgb(photo)[brushed].mean()
+    dark, bright = (under_the_brush(relighter, photo, brushed, [light] * 3).mean() for light in (0.0, 3.0))
+    assert dark < 0.8 * before < before < bright
+    assert bright > 1.5 * dark
+
+
+def test_red_strokes_redden_and_blue_ones_turn_blue(relighter, photo, brushed):
+    red = under_the_brush(relighter, photo, brushed, [2.0, 0.4, 0.4])
+    blue = under_the_brush(relighter, photo, brushed, [0.4, 0.4, 2.0])
+    assert red[0] / red[2] > 1.5 * blue[0] / blue[2]
