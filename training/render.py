@@ -92,6 +92,7 @@ def render_scenes(
     0 .. scenes - 1, so that sets of different seeds share none. Raises InputError where nothing can be
     written.
     """
+    mitsuba()  # where it is missing, no folder is made
     make_folder(out)
     index, count = shard
     mine = [seed * 1_000_000 + k for k in range(index, scenes, count)]
