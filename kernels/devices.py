@@ -56,7 +56,7 @@ def prepare_caches() -> None:
 
     PoCL would use ~/.cache/pocl/kcache, have no device at all where that cannot be written, and, without a
     HOME, load code from /tmp/pocl, which anyone may have put there. Its last resort here is a temporary
-    folder of this process; pyopencl's is to cache nothing. To be called before pyopencl is imported. """
+    folder of this process; pyopencl's is to cache nothing. To be called before pyopencl is imported."""
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home, "pocl", "kcache")

@@ -29,9 +29,7 @@ def self_test(ops: Ops, dtypes: tuple[npt.DTypeLike, ...] = (np.uint8,)) -> None
             raise KernelError(f"{ops.name} failed its self-test of {name} ({problem})") from error
         for a, b in zip(got, expected, strict=True):
             if a.shape != b.shape or a.dtype != b.dtype:
-                raise KernelError(
-                    f"{ops.name} failed its self-test of {name}: the result is of another kind."
-                )
+                raise KernelError(f"{ops.name} failed its self-test of {name}: the result is of another kind")
             worst = float(np.abs(a.astype(np.float64) - b.astype(np.float64)).max())
             # Written so that NaN fails too.
             if not worst <= tolerance:

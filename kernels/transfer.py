@@ -23,7 +23,7 @@ from dior_rt.kernels.color import linear_to_srgb
 from dior_rt.kernels.types import FloatArray
 
 EPSILON = 0.02
-SIGMA = 0.04
+SIGMA = 0.03
 #: The lightness g of a pixel: this mean of its sRGB-encoded channels, clipped to 0..1.
 LIGHTNESS = np.array([0.25, 0.5, 0.25], np.float32)
 

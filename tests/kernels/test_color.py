@@ -114,7 +114,9 @@ def test_arrays_need_not_be_contiguous_or_writable(ops):
     view = picture[::-2, 3::2].transpose(1, 0, 2)
     view.setflags(write=False)
     np.testing.assert_array_equal(ops.decode_srgb(view), ops.decode_srgb(view.copy()))
-    np.testing.assert_array_equal(ops.encode_srgb(ops.decode_srgb(picture)[:, ::3], np.uint8), picture[:, ::3])
+    np.testing.assert_array_equal(
+        ops.encode_srgb(ops.decode_srgb(picture)[:, ::3], np.uint8), picture[:, ::3]
+    )
 
 
 def test_other_dtypes_are_refused(ops):

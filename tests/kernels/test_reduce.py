@@ -31,7 +31,9 @@ def random_picture(size, dtype, seed=0):
 @pytest.mark.parametrize("size", SIZES)
 def test_a_photo_becomes_its_area_means(ops, size, grid):
     photo = random_picture(size, np.uint8)
-    np.testing.assert_allclose(ops.reduce_photo(photo, grid), area_mean(ops.decode_srgb(photo), grid), atol=2e-6)
+    np.testing.assert_allclose(
+        ops.reduce_photo(photo, grid), area_mean(ops.decode_srgb(photo), grid), atol=2e-6
+    )
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
@@ -79,7 +81,9 @@ def test_strokes_become_masked_means(ops, size, grid):
     specified = got.mask > 0
     # The reference's own rounding leaves some 1e-16 where there is nothing.
     np.testing.assert_array_equal(got.mask, weight[..., 0] > 1e-12)
-    np.testing.assert_allclose(got.light[specified], (total / np.maximum(weight, 1e-300))[specified], rtol=1e-5)
+    np.testing.assert_allclose(
+        got.light[specified], (total / np.maximum(weight, 1e-300))[specified], rtol=1e-5
+    )
     assert (got.light[~specified] == 0).all()
     assert got.light.dtype == got.mask.dtype == np.float32
 
