@@ -25,7 +25,9 @@ from dior_rt.cli import run
 from dior_rt.errors import DeviceError, InputError
 from dior_rt.pictures import read_photo
 from dior_rt.strokes import read_strokes
+from dior_rt.training.network import load_network
 
+CHECKPOINT = Path(__file__).parents[2] / "training" / "checkpoints" / "mini" / "model.safetensors"
 SETTING = Setting("mini", 40, 2.0, "cpu", "numpy", None)
 
 
@@ -144,14 +146,15 @@ def test_operations_of_nodes() -> None:
 
 @pytest.mark.parametrize(("guidance", "branches"), [(1.0, 1), (3.0, 2)])
 def test_operations_of_a_network_counted_by_hand(mini_bundle: Path, guidance: float, branches: int) -> None:
-    # Width 48, two blocks, patch 4, 8 features a cell; see the small mini that all tests share.
+    network = load_network(CHECKPOINT).config
     rows, columns = read_bundle(mini_bundle).manifest.grid.shape(100, 150)
-    cells, tokens, width = rows * columns, rows * columns // 16, 48
+    area = network.patch**2
+    cells, tokens, width, features = rows * columns, rows * columns // area, network.width, network.features
     once = width * width * 2 + width * 6 * width  # time, modulation
     block = tokens * width * (3 * width + width + 8 * width) + 2 * tokens * tokens * width
-    ends = tokens * width * (10 * 16 + 8 * 16)  # embed, unembed
-    convolutions = cells * 9 * (8 * 18 + 6 * 8)  # smooth, head
-    wanted = 2 * branches * (once + 2 * block + ends + convolutions)
+    ends = tokens * width * (10 + features) * area  # embed, unembed
+    convolutions = cells * 9 * features * (features + 10 + 6)  # smooth, head
+    wanted = 2 * branches * (once + network.depth * block + ends + convolutions)
     assert step_flops(read_bundle(mini_bundle), (100, 150), guidance) == wanted
 
 
