@@ -74,8 +74,12 @@ def test_a_line_has_the_area_of_its_capsule(ops, width):
 
 
 @given(
-    x=st.floats(8, 24), y=st.floats(8, 24), dx=st.floats(-8, 8), dy=st.floats(-8, 8), width=st.floats(1e-3, 1.0)
-)  # fmt: skip
+    x=st.floats(8, 24),
+    y=st.floats(8, 24),
+    dx=st.floats(-8, 8),
+    dy=st.floats(-8, 8),
+    width=st.floats(1e-3, 1.0),
+)
 @settings(deadline=None)
 def test_a_thin_stroke_is_faint_but_there(x, y, dx, dy, width):
     drawn = NumpyOps().draw_strokes([Stroke(((x, y), (x + dx, y + dy)), width, (0.0, 3.0, 0.0))], (32, 32))

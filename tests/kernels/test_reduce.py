@@ -1,4 +1,4 @@
-"""Photos and strokes on the light grid: exact area means, and masked means that never see what is unspecified."""
+"""Photos and strokes on the light grid: exact area means, and masked means that see only what is drawn."""
 
 import numpy as np
 import pytest
@@ -10,6 +10,11 @@ SIZES = [(1, 1), (1, 7), (7, 1), (33, 65), (257, 129)]
 GRIDS = [(1, 1), (4, 4), (5, 3), (16, 40), (64, 64)]
 
 
+def _at(line, places):
+    """The values of a line of samples at places between them."""
+    return np.interp(places, np.arange(len(line)), line)
+
+
 def area_mean(picture, grid):
     """Float64: the difference of the integral image, linear between pixels, at the cells' borders."""
     for axis, cells in enumerate(grid):
@@ -17,7 +22,7 @@ def area_mean(picture, grid):
         sums = np.cumsum(picture, axis, dtype=np.float64)
         sums = np.concatenate([np.zeros_like(sums.take([0], axis)), sums], axis)
         at = np.arange(cells + 1) * pixels / cells
-        integral = np.apply_along_axis(lambda line: np.interp(at, np.arange(len(line)), line), axis, sums)
+        integral = np.apply_along_axis(_at, axis, sums, at)
         picture = np.diff(integral, axis=axis) * (cells / pixels)
     return picture
 
