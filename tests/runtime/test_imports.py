@@ -5,12 +5,14 @@ import sys
 
 WALK = """
 import importlib, pkgutil, sys
-import dior_rt, dior_rt.family, dior_rt.kernels
+import dior_rt, dior_rt.kernels
 
-for package in (dior_rt, dior_rt.family, dior_rt.kernels):
-    for module in pkgutil.iter_modules(package.__path__, package.__name__ + "."):
-        if not module.name.endswith("__main__"):
+OTHERS = ("dior_rt.export", "dior_rt.training", "dior_rt.__main__")
+for package in (dior_rt, dior_rt.kernels):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.startswith(OTHERS):
             importlib.import_module(module.name)
+assert {"dior_rt.cli.app", "dior_rt.family.mini", "dior_rt.kernels.opencl_ops"} <= sys.modules.keys()
 dior_rt.Relighter
 extras = "torch onnx onnxscript safetensors peft accelerate mitsuba diffusers transformers".split()
 print(*(name for name in extras if name in sys.modules))
