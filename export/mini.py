@@ -22,6 +22,7 @@ from torch.export import Dim
 
 from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
 from dior_rt.engine import Engine
+from dior_rt.errors import InputError
 from dior_rt.export.check import (
     ExportError,
     check_evaluations,
@@ -90,28 +91,26 @@ def export_network(
 ) -> Bundle:
     """Write a network's bundle at `out`. Its inputs and output are those of mini in docs/contracts.md.
 
-    weights: how they are stored; the graph computes in float32 either way. Raises ExportError where the graph
-    computes something else than torch with the same weights, and BundleError where nothing can be written.
+    weights: how they are stored; for fp16 the network's own are rounded in place. The graph computes in
+    float32 either way. Raises InputError for a recipe that cannot be, ExportError where the graph computes
+    something else than torch with the same weights, and BundleError where nothing can be written.
     """
     check_target(out, overwrite)
+    manifest, grid = describe(recipe, weights), recipe.grid
     network = network.eval()
-    parity = {}
-    if weights == "fp16":
-        parity["weights_as_fp16"] = round_to_half(network, recipe.grid)
+    parity = {"weights_as_fp16": round_to_half(network, grid)} if weights == "fp16" else {}
     with tempfile.TemporaryDirectory() as scratch:
         graph, probe = Path(scratch) / GRAPH, Path(scratch) / PROBE
-        convert(network, graph, recipe.grid.multiple)
+        convert(network, graph, grid.multiple)
         if weights == "fp16":
             store_as_half(graph)
-        onnx.checker.check_model(graph, full_check=True)
-        engine = Engine(graph)
-        parity["evaluation"] = check_evaluations(network, engine, recipe.grid)
-        sigmas = recipe.schedule.sigmas(recipe.steps)
-        parity["sampling_db"] = check_sampling(
-            network, partial(mini.bind, engine), recipe.grid, sigmas, recipe.guidance
-        )
-        save_probe(network, probe, recipe.grid)
-        manifest = describe(recipe, engine, weights, parity)
+        engine = open_checked(graph)
+        bind, sigmas = partial(mini.bind, engine), recipe.schedule.sigmas(recipe.steps)
+        parity["evaluation"] = check_evaluations(network, engine, grid)
+        parity["sampling_db"] = check_sampling(network, bind, grid, sigmas, recipe.guidance)
+        save_probe(network, probe, grid)
+        graphs = {"velocity": Graph(GRAPH, engine.inputs, engine.outputs, PROBE)}
+        manifest = replace(manifest, graphs=graphs, parity=parity)
         return write_bundle(out, manifest, {GRAPH: graph, PROBE: probe}, overwrite=overwrite)
 
 
@@ -181,24 +180,36 @@ def save_probe(network: torch.nn.Module, path: Path, grid: GridRule) -> None:
     np.savez(path, **arrays)
 
 
-def describe(recipe: Recipe, engine: Engine, weights: Weights, parity: dict[str, float]) -> Manifest:
-    """The manifest of an exported network."""
-    return Manifest(
-        family="mini",
-        name=recipe.name,
-        licence="Apache-2.0",
-        precision=weights,
-        files={},
-        graphs={"velocity": Graph(GRAPH, engine.inputs, engine.outputs, PROBE)},
-        schedule=recipe.schedule,
-        steps=recipe.steps,
-        guidance=recipe.guidance,
-        colour="srgb",
-        grid=recipe.grid,
-        noise_scale=recipe.noise_scale,
-        parity=parity,
-        settings={},
-    )
+def open_checked(graph: Path) -> Engine:
+    """The graph in ONNX Runtime, after ONNX's own checker. Raises ExportError."""
+    try:
+        onnx.checker.check_model(graph, full_check=True)
+    except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
+        raise ExportError(f"The network became a graph that is not valid ONNX: {reason(error)}.") from error
+    return Engine(graph)
+
+
+def describe(recipe: Recipe, weights: Weights) -> Manifest:
+    """The manifest of an export, before its graph is made. Raises InputError for a recipe that cannot be."""
+    try:
+        return Manifest(
+            family="mini",
+            name=recipe.name,
+            licence="Apache-2.0",
+            precision=weights,
+            files={},
+            graphs={},
+            schedule=recipe.schedule,
+            steps=recipe.steps,
+            guidance=recipe.guidance,
+            colour="srgb",
+            grid=recipe.grid,
+            noise_scale=recipe.noise_scale,
+            parity={},
+            settings={},
+        )
+    except ValueError as error:
+        raise InputError(f"The model cannot be run so: {reason(error)}.") from error
 
 
 def _present(folder: Path) -> Path | None:

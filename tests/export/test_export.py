@@ -24,7 +24,7 @@ from dior_rt.export.check import (
     random_feeds,
     relative_error,
 )
-from dior_rt.export.mini import export_checkpoint, export_network, round_to_half, store_as_half
+from dior_rt.export.mini import export_checkpoint, export_network, open_checked, round_to_half, store_as_half
 from dior_rt.family import mini
 from dior_rt.schedule import ShiftSchedule
 from dior_rt.training.network import save_network
@@ -205,6 +205,21 @@ def test_a_network_that_is_no_graph_is_refused(recipe, tmp_path):
     with pytest.raises(ExportError, match="ONNX"):
         export_network(Undecided(), recipe, tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("change", [{"steps": 0}, {"guidance": -1.0}, {"noise_scale": float("nan")}])
+def test_a_recipe_that_cannot_be_is_refused_before_any_work(network, recipe, tmp_path, monkeypatch, change):
+    monkeypatch.setattr(export, "convert", lambda *_: pytest.fail("it went to work"))
+    with pytest.raises(InputError, match=next(iter(change))):
+        export_network(network, dataclasses.replace(recipe, **change), tmp_path / "b")
+
+
+def test_a_graph_that_is_no_onnx_is_refused(exported, tmp_path):
+    model = onnx.load(exported.path("velocity"))
+    model.graph.node[0].op_type = "Unheard"
+    onnx.save(model, tmp_path / "model.onnx")
+    with pytest.raises(ExportError, match="not valid ONNX"):
+        open_checked(tmp_path / "model.onnx")
 
 
 def test_a_bundle_in_the_way_is_found_before_any_work(network, recipe, tmp_path, monkeypatch):
