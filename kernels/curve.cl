@@ -17,11 +17,9 @@ inline float log2_of(float x) {
        + s * (2.8853900818f + q * (0.9617966939f + q * (0.5770780164f + q * (0.4121985831f + q * 0.3205988980f))));
 }
 
-/* 2^y within 2e-7 of itself, and exactly 1 at 0: the nearest integer through the exponent's bits (adding 1.5 * 2^23
+/* 2^y for y in -126..127, within 2e-7 of itself, and exactly 1 at 0: the nearest integer through the exponent's bits (adding 1.5 * 2^23
  * rounds to it), the rest, in -1/2..1/2, by a minimax polynomial. */
 inline float exp2_of(float y) {
-  y = y < -126.0f ? -126.0f : y;
-  y = y > 127.0f ? 127.0f : y;
   float whole = (y + 12582912.0f) - 12582912.0f, f = y - whole;
   float p = 1.0f + f * (0.6931472657f + f * (0.2402225081f
           + f * (0.05550184488f + f * (0.009671327265f + f * 0.001344868755f))));
@@ -31,8 +29,8 @@ inline float exp2_of(float y) {
 /* The curve for any float; infinities and NaN stay what they are. */
 inline float linear_of(float v) {
   float base = v > 0.04045f ? v : 0.04045f;
-  float power = exp2_of(2.4f * log2_of((base + 0.055f) / 1.055f));
-  float x = v <= 0.04045f ? v / 12.92f : power;
+  float y = 2.4f * log2_of((base + 0.055f) / 1.055f);
+  float x = v <= 0.04045f ? v / 12.92f : y < 127.0f ? exp2_of(y) : INFINITY;
   return v - v == 0.0f ? x : v;
 }
 

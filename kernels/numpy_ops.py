@@ -24,7 +24,8 @@ class NumpyOps(Ops):
     def _decode(self, picture: Picture) -> FloatArray:
         if picture.dtype != np.float32:
             return decode_table(picture.dtype)[picture]
-        power = ((np.maximum(picture, np.float32(ENCODED_KNEE)) + 0.055) / 1.055) ** 2.4
+        with np.errstate(over="ignore"):
+            power = ((np.maximum(picture, np.float32(ENCODED_KNEE)) + 0.055) / 1.055) ** 2.4
         return np.where(picture <= ENCODED_KNEE, picture / np.float32(12.92), power)
 
     def _encode(self, linear: FloatArray, dtype: np.dtype) -> Picture:
@@ -95,11 +96,11 @@ class NumpyOps(Ops):
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
         for rows in bands(height, width, BAND):
             linear = self._decode(photo[rows])
-            lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1)
+            lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1) / np.float32(SIGMA)
             total = np.zeros((*lightness.shape, 4), np.float32)
             for k, m in np.ndindex(3, 3):
                 near = nodes[row[rows, None] + k, column + m]
-                distance = (lightness - near[..., 3]) / np.float32(SIGMA)
+                distance = lightness - near[..., 3]
                 weight = down[k, rows, None] * across[m] * rough_reciprocal(1 + distance * distance)
                 near[..., 3] = 1
                 total += weight[..., None] * near

@@ -141,6 +141,7 @@ class OpenCLOps(Ops):
                 "FLOOR": f"{table.floor:.9g}f",
             }
         constants = {"EPSILON": f"{EPSILON}f", "SIGMA": f"{SIGMA}f", "TILE": f"{draw.TILE}"}
+        constants["LANES"] = f"{self._session.lanes}"
         return self._session.kernel(name, **curve, **constants, **defines)
 
     def _decode_table(self, dtype: np.dtype) -> cl.Buffer | None:

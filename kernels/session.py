@@ -34,6 +34,8 @@ class Session:
         try:
             self._context = cl.Context([device.handle])
             self._queue = cl.CommandQueue(self._context)
+            #: Floats that the device handles at a time.
+            self.lanes = max(1, min(16, device.handle.preferred_vector_width_float))
             self._shares_memory = bool(device.handle.host_unified_memory)
         except cl.Error as error:
             raise KernelError(f"{self.name} cannot be opened ({error})") from error

@@ -29,10 +29,13 @@ LIGHTNESS = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 def nodes(source: FloatArray, relit: FloatArray) -> FloatArray:
-    """(h, w, 3) linear grids -> (h + 2, w + 2, 4) float32: log2 R and g of each cell, the border repeated."""
+    """(h, w, 3) linear grids -> (h + 2, w + 2, 4) float32: log2 R, g / SIGMA by cell, the border repeated.
+
+    log2 R is kept within -126..126, so that R is a normal float32.
+    """
     quotient = (relit.astype(np.float64) + EPSILON) / (source.astype(np.float64) + EPSILON)
-    log_r = _sharpen(np.log2(quotient))
-    lightness = np.clip(linear_to_srgb(source) @ LIGHTNESS, 0, 1)
+    log_r = _sharpen(np.clip(np.log2(quotient), -126, 126))
+    lightness = np.clip(linear_to_srgb(source) @ LIGHTNESS, 0, 1) / SIGMA
     cells = np.concatenate([log_r, lightness[..., None]], 2)
     return np.pad(cells, ((1, 1), (1, 1), (0, 0)), mode="edge").astype(np.float32)
 

@@ -56,6 +56,10 @@ def test_floats_beyond_the_range_follow_the_curve(ops):
     np.testing.assert_allclose(ops.encode_srgb(x, np.float32), encode(x), rtol=2e-6, atol=1e-9)
 
 
+def test_what_no_float_can_hold_is_infinite(ops):
+    assert np.isinf(ops.decode_srgb(np.array([1e20, 3e38], np.float32))).all()
+
+
 def test_floats_that_are_no_numbers_stay_what_they_are(ops):
     odd = np.array([np.nan, np.inf, -np.inf], np.float32)
     np.testing.assert_array_equal(ops.decode_srgb(odd), odd)
