@@ -94,17 +94,19 @@ class NumpyOps(Ops):
         row, down = spline_taps(height, nodes.shape[0] - 2)
         column, across = spline_taps(width, nodes.shape[1] - 2)
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
+        # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane a quantity.
+        near_columns = [np.ascontiguousarray(np.moveaxis(nodes[:, column + m], 2, 0)) for m in range(3)]
         for rows in bands(height, width, BAND):
-            linear = self._decode(photo[rows])
             lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1) / np.float32(SIGMA)
-            total = np.zeros((*lightness.shape, 4), np.float32)
+            total = np.zeros((4, *lightness.shape), np.float32)
             for k, m in np.ndindex(3, 3):
-                near = nodes[row[rows, None] + k, column + m]
-                distance = lightness - near[..., 3]
-                weight = down[k, rows, None] * across[m] * rough_reciprocal(1 + distance * distance)
-                near[..., 3] = 1
-                total += weight[..., None] * near
-            gain = np.exp2(total[..., :3] / total[..., 3:]) - 1
+                near = near_columns[m][:, row[rows] + k]
+                distance = lightness - near[3]
+                weight = rough_reciprocal(1 + distance * distance) * (down[k, rows, None] * across[m])
+                near[3] = 1
+                total += weight * near
+            gain = np.moveaxis(np.exp2(total[:3] / total[3]) - 1, 0, 2)
+            linear = self._decode(photo[rows])
             result[rows] = self._encode(linear + (linear + np.float32(EPSILON)) * gain, photo.dtype)
         return result
 
