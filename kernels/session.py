@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 import pyopencl as cl
@@ -18,8 +19,24 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent
 SOURCES = ("curve.cl", "reduce.cl", "transfer.cl", "draw.cl", "sparsify.cl")
+P = ParamSpec("P")
+T = TypeVar("T")
 #: How many neighbours one work item takes on a CPU.
 CPU_RUN = 4096
+
+
+def _translated(method: Callable[P, T]) -> Callable[P, T]:
+    """The method, raising KernelError, one sentence, for what OpenCL reports."""
+
+    @wraps(method)
+    def translated(*args: P.args, **kwargs: P.kwargs) -> T:
+        try:
+            return method(*args, **kwargs)
+        except cl.Error as error:
+            problem = str(error).partition("\n")[0]
+            raise KernelError(f"the OpenCL device failed ({problem})") from error
+
+    return translated
 
 
 class Session:
@@ -44,6 +61,7 @@ class Session:
         self._programs: dict[tuple[str, ...], cl.Program] = {}
         self._constants: dict[int, tuple[np.ndarray, cl.Buffer]] = {}
 
+    @_translated
     def kernel(self, name: str, **defines: object) -> cl.Kernel:
         """The kernel of that name, of the program that is built with -Dkey=value for each of `defines`.
 
@@ -58,6 +76,7 @@ class Session:
                 self._programs[options] = program
         return cl.Kernel(program, name)
 
+    @_translated
     def launch(self, kernel: cl.Kernel, count: int, rows: int, *args: cl.Buffer | int | None) -> None:
         """Run the kernel over `rows` rows of `count` things and wait, so that no buffer need outlive the
         call.
@@ -71,6 +90,7 @@ class Session:
             kernel.set_arg(place, np.int32(arg) if isinstance(arg, int) else arg)
         cl.enqueue_nd_range_kernel(self._queue, kernel, items, group).wait()
 
+    @_translated
     def constant(self, array: np.ndarray) -> cl.Buffer:
         """A copy of an array that lives as long as the session, once for each array."""
         with self._lock:
@@ -79,14 +99,17 @@ class Session:
                 self._constants[id(array)] = array, cl.Buffer(self._context, flags, hostbuf=array)
             return self._constants[id(array)][1]
 
+    @_translated
     def scratch(self, size: int) -> cl.Buffer:
         """An uninitialised buffer of `size` bytes on the device."""
         return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
 
+    @_translated
     def clear(self, buffer: cl.Buffer) -> None:
         """Set every byte to 0."""
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, np.uint8), 0, buffer.size).wait()
 
+    @_translated
     def input(self, array: np.ndarray) -> cl.Buffer:
         """The array as the device sees it; the array itself if it is contiguous and the memory is shared."""
         share = cl.mem_flags.USE_HOST_PTR if self._shares_memory else cl.mem_flags.COPY_HOST_PTR
@@ -98,13 +121,20 @@ class Session:
 
         What they do not write is undefined where the device has its own memory.
         """
+        buffer = self._share(array) if self._shares_memory else self.scratch(array.nbytes)
+        yield buffer
+        self._fetch(array, buffer)
+
+    @_translated
+    def _share(self, array: np.ndarray) -> cl.Buffer:
+        return cl.Buffer(self._context, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, hostbuf=array)
+
+    @_translated
+    def _fetch(self, array: np.ndarray, buffer: cl.Buffer) -> None:
         if not self._shares_memory:
-            buffer = self.scratch(array.nbytes)
-            yield buffer
             cl.enqueue_copy(self._queue, array, buffer)
             return
-        buffer = cl.Buffer(self._context, cl.mem_flags.READ_WRITE | cl.mem_flags.USE_HOST_PTR, hostbuf=array)
-        yield buffer
+        # Mapping is what makes the host see a shared buffer; where memory is really shared it copies nothing.
         mapped, _ = cl.enqueue_map_buffer(
             self._queue, buffer, cl.map_flags.READ, 0, array.shape, array.dtype, strides=array.strides
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dior_rt.kernels import KernelError, NumpyOps, Strokes, list_devices, open_ops, self_test
+from dior_rt.kernels import KernelError, NumpyOps, OpenCLOps, Strokes, list_devices, open_ops, self_test
 
 REPORT = "from dior_rt.kernels import open_ops; ops = open_ops('auto'); print(ops.name, '|', ops.reason)"
 
@@ -84,6 +84,18 @@ def test_devices_are_opened_by_number_and_by_name():
     for device in list_devices_or_none():
         assert open_ops(f"opencl:{device.index}").name.startswith(f"opencl:{device.index} ")
         assert device.name in open_ops(f"opencl:{device.name[:9].upper()}").name
+
+
+def test_a_device_with_memory_of_its_own_passes_too(opencl):
+    """What a GPU is given: copies, a work item a cell or pixel, groups of the driver's choice, one lane."""
+    ops = OpenCLOps(list_devices()[int(opencl.name.split()[0].removeprefix("opencl:"))])
+    ops._session._shares_memory, ops._session._run, ops._session.lanes = False, 1, 1
+    self_test(ops)
+
+
+def test_what_a_driver_reports_is_one_sentence(opencl):
+    with pytest.raises(KernelError, match=r"^the OpenCL device failed \(.*\)$"):
+        opencl._session.scratch(1 << 62)
 
 
 def list_devices_or_none():
