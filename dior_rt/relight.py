@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from dior_rt.family.qwen import Qwen
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.sampler import Array, draw_noise, sample
+from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
 
@@ -184,19 +184,6 @@ class Relighter:
             if progress and progress(state.step, state.steps) is False:
                 raise Cancelled(f"Stopped after step {state.step} of {state.steps}.")
         return state.x
-
-
-class Stopwatch:
-    """Seconds by stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap on `stage`."""
-        now = perf_counter()
-        self.seconds[stage], self._last = now - self._last, now
 
 
 def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:

@@ -36,12 +36,10 @@ from dior_rt.family import mini
 from dior_rt.files import reason
 from dior_rt.grid import GridRule
 from dior_rt.schedule import ShiftSchedule
-from dior_rt.training.network import load_network
+from dior_rt.training.network import LORA, WEIGHTS, load_network
 
 Weights = Literal["fp16", "fp32"]
 
-CHECKPOINT: Final = "model.safetensors"
-LORA: Final = "lora"
 GRAPH: Final = "model.onnx"
 PROBE: Final = "probe.npz"
 LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothing
@@ -79,7 +77,7 @@ def export_checkpoint(
     """
     check_target(out, overwrite)
     if checkpoint.is_dir():
-        checkpoint, lora = checkpoint / CHECKPOINT, lora or _present(checkpoint / LORA)
+        checkpoint, lora = checkpoint / WEIGHTS, lora or _present(checkpoint / LORA)
     network = load_network(checkpoint)
     recipe = replace(recipe, grid=replace(recipe.grid, multiple=network.config.patch))
     merged = merge_lora(network, lora) if lora else network

@@ -21,13 +21,11 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from dior_rt.files import make_folder
-from dior_rt.training.network import Config, Mini, load_network, save_network
+from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.state import Average, State
 from dior_rt.training.triplets import Batches, load_views
 
-WEIGHTS: Final = "model.safetensors"  # what export reads: the average of the weights
 STATE: Final = "state.safetensors"  # what a run resumes from
-LORA: Final = "lora"
 LORA_TARGETS: Final = ["qkv", "proj", "up", "down", "modulation", "unembed"]
 
 Progress = Callable[[int, float], None]  # step, running loss

@@ -24,6 +24,10 @@ from torch.nn import functional as F
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, reason, replacing
 
+# The files of a checkpoint: what training writes and export reads.
+WEIGHTS = "model.safetensors"
+LORA = "lora"
+
 FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
 RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0

@@ -11,10 +11,15 @@ Raster = NDArray[np.float32]
 SIZE = 128
 
 
+def rainbow(hue: float) -> NDArray[np.float64]:
+    """The fully saturated RGB of a hue in 0..1: HSV's, of saturation and value 1."""
+    return np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
+
+
 def color(rng: Generator) -> Raster:
     """One reflectance (3,): any hue, a saturation mostly low as in paint, the values of real surfaces."""
     hue, saturation, value = rng.uniform(), rng.beta(1.2, 2.0), rng.uniform(0.05, 0.85)
-    ramp = np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
+    ramp = rainbow(hue)
     return np.clip(value * (1 - saturation * (1 - ramp)), 0.02, 0.9).astype(np.float32)
 
 

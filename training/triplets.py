@@ -26,6 +26,7 @@ from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
 from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb
 from dior_rt.training.render import View
+from dior_rt.training.textures import rainbow
 
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
 Raster = NDArray[np.float32]
@@ -59,8 +60,7 @@ def tint(rng: Generator) -> Raster:
         warmth = rng.normal(0, 0.25)
         return np.exp([warmth, 0.0, -1.4 * warmth]).astype(np.float32)
     hue, saturation = rng.uniform(), rng.uniform(0.2, 1.0)
-    ramp = np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
-    shade = 1 - saturation * (1 - ramp)
+    shade = 1 - saturation * (1 - rainbow(hue))
     return (shade / max(shade.mean(), 0.4)).astype(np.float32)
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from dior_rt.bench.plan import Setting
 from dior_rt.errors import DiorError, InputError
 from dior_rt.records import parse, unparse
+from dior_rt.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def work(job: Job) -> Sample:
     """Relight every pair once to warm up, with a single step, and once for the clock."""
     import numpy as np
 
-    from dior_rt.relight import Relighter, Stopwatch
+    from dior_rt.relight import Relighter
 
     setting, sums, started = job.setting, dict.fromkeys(STAGES, 0.0), []
     relighter = Relighter(setting.bundle, setting.device, setting.ops, setting.threads)

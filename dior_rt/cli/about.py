@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from dior_rt.cli import options
+from dior_rt.cli.text import table
 
 
 def devices(
@@ -40,7 +41,7 @@ def devices(
             (f"  {device.name}", f"{device.description}: {device.problem or 'passes its test'}")
             for device in survey.devices
         ]
-        _table([*rows, ("  auto", f"{survey.auto.name}: {survey.auto.reason}")])
+        table([*rows, ("  auto", f"{survey.auto.name}: {survey.auto.reason}")])
 
 
 def info(
@@ -76,10 +77,4 @@ def info(
         "graphs": ", ".join(sorted(manifest.graphs)),
         **{f"parity {name}": f"{value:.4g}" for name, value in manifest.parity.items()},
     }
-    _table(list(rows.items()))
-
-
-def _table(rows: list[tuple[str, object]]) -> None:
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        typer.echo(f"{name:<{width}}  {value}")
+    table(list(rows.items()))

@@ -10,6 +10,7 @@ import typer
 
 from dior_rt.cli import options
 from dior_rt.cli.extras import needs_extra
+from dior_rt.cli.text import table
 from dior_rt.errors import InputError
 
 Precision = Literal["fp32", "fp16", "int8", "int4"]
@@ -110,10 +111,7 @@ def export(
                 weights="fp32" if weights == "fp32" else "fp16",
                 overwrite=overwrite,
             )
-    rows = [(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()]
-    width = max(len(name) for name, _ in rows)
-    for name, value in rows:
-        typer.echo(f"{name:<{width}}  {value}")
+    table([(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()])
 
 
 def _path_and_strength(text: str) -> tuple[Path, float]:

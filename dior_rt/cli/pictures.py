@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ import typer
 from dior_rt import __version__
 from dior_rt.cli import options
 from dior_rt.errors import InputError
+from dior_rt.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
     from dior_rt.relight import Relighter
@@ -177,23 +177,14 @@ def sparsify(
         _say("Light above display white was clipped; a .npy file keeps it.")
 
 
-class Watch:
+class Watch(Stopwatch):
     """Seconds by stage, and until the first step of the sampler."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._start = self._last = perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap on `stage`."""
-        now = perf_counter()
-        self.seconds[stage], self._last = now - self._last, now
 
     def first_step(self, advance: Callable[[int, int], None]) -> Callable[[int, int], None]:
         """`advance`, which also notes when it is called first."""
 
         def noted(step: int, steps: int) -> None:
-            self.seconds.setdefault("first_step", perf_counter() - self._start)
+            self.seconds.setdefault("first_step", perf_counter() - self.start)
             advance(step, steps)
 
         return noted
@@ -214,13 +205,10 @@ def _loading(bundle: Path | None, device: str, ops: str) -> Iterator[Callable[[]
 
 def _settings(relighter: Relighter) -> dict[str, Any]:
     """What made the result, for its metadata. The manifest's hash covers those of all files."""
-    from dior_rt.bundle import MANIFEST
-
-    manifest = (relighter.bundle.folder / MANIFEST).read_bytes()
     return {
         "version": __version__,
         "bundle": relighter.bundle.manifest.name,
-        "bundle_sha256": hashlib.sha256(manifest).hexdigest(),
+        "bundle_sha256": relighter.bundle.sha256,
         "device": relighter.device,
         "ops": relighter.ops,
     }

@@ -11,8 +11,8 @@ from safetensors.torch import load_file
 
 from dior_rt.errors import InputError
 from dior_rt.export.lora import merge_lora
-from dior_rt.training.fit import LORA, STATE, WEIGHTS, Plan, draw_sigma, fit, fit_lora, flow_loss
-from dior_rt.training.network import Config, Mini, load_network
+from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss
+from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network
 from dior_rt.training.triplets import Batches
 
 TINY = Config(width=32, depth=1, heads=2, patch=8, features=8)
