@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,15 @@ Progress = Callable[[int, int], bool | None]
 CANVAS = 2048  # pixels of the longest side on which strokes given as lines are drawn
 
 NOTHING_DRAWN = "The strokes specify nothing, so the photo is unchanged."
+
+
+@contextmanager
+def _device_errors() -> Iterator[None]:
+    """Turn what the kernels say of a device, at any moment, into DeviceError; it decorates as well."""
+    try:
+        yield
+    except KernelError as error:
+        raise DeviceError(str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -70,13 +80,12 @@ class Relighter:
         """
         self.bundle = read_bundle(Path(bundle) if bundle else default_bundle())
         self._family = open_family(self.bundle, device, threads)
-        try:
+        with _device_errors():
             self._ops = open_ops(ops)
-        except KernelError as error:
-            raise DeviceError(str(error)) from error
         self.device, self.device_reason = self._family.device, self._family.reason
         self.ops, self.ops_reason = self._ops.name, self._ops.reason
 
+    @_device_errors()
     def relight(
         self,
         photo: Picture,
@@ -119,6 +128,7 @@ class Relighter:
         watch.lap("transfer")
         return Relit(picture, None, watch.seconds, steps, guidance, seed, intensity)
 
+    @_device_errors()
     def estimate(
         self, photo: Picture, *, steps: int | None = None, seed: int = 0, progress: Progress | None = None
     ) -> Array:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from dior_rt.bundle import read_bundle, write_bundle
 from dior_rt.errors import BundleError, Cancelled, DeviceError, InputError
-from dior_rt.kernels import NumpyOps, Strokes
+from dior_rt.kernels import KernelError, NumpyOps, Strokes
 from dior_rt.relight import Relighter
 
 CHECKPOINT = Path(__file__).parents[2] / "training" / "checkpoints" / "mini"
@@ -239,3 +239,17 @@ def test_what_is_not_there_is_refused(mini_bundle, option, error):
 def test_a_folder_that_is_no_bundle_is_refused(tmp_path):
     with pytest.raises(BundleError):
         Relighter(tmp_path)
+
+
+@pytest.mark.parametrize("work", ["relight", "estimate"])
+def test_a_driver_that_fails_on_the_way_is_a_device_error(mini_bundle, monkeypatch, work):
+    """What OpenCLOps raises when a driver gives up in the middle of a run."""
+    relighter = Relighter(mini_bundle, device="cpu", ops="numpy")
+
+    def give_up(self, picture, grid):
+        raise KernelError("The OpenCL device gave up: out of resources.")
+
+    monkeypatch.setattr(NumpyOps, "reduce_photo", give_up)
+    arguments = (photo(), drawing()) if work == "relight" else (photo(),)
+    with pytest.raises(DeviceError, match=r"gave up: out of resources"):
+        getattr(relighter, work)(*arguments)
