@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -320,6 +321,15 @@ def test_debug_shows_where_it_happened(folder: Path, capfd) -> None:
     assert said.splitlines()[-1].startswith("dior-rt: ")
 
 
+@pytest.fixture
+def listening() -> Iterator[None]:
+    """Ctrl-C as in a terminal: a shell starts its background jobs deaf to it, and children inherit that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("listening")
 def test_ctrl_c_is_130_and_leaves_nothing(relight, folder: Path, monkeypatch, capfd) -> None:
     from contextlib import contextmanager
 
