@@ -8,7 +8,7 @@ answer has to come from the condition; the others at sigmas shifted towards it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -16,20 +16,22 @@ from typing import Final, Literal
 
 import torch
 from accelerate import Accelerator
-from peft import LoraConfig, PeftModel, get_peft_model
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, IterableDataset
 
+from dior_rt.errors import InputError
 from dior_rt.files import make_folder
-from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network, save_network
+from dior_rt.training.backbone import MiniLora
+from dior_rt.training.network import WEIGHTS, Config, Mini, save_network
 from dior_rt.training.state import Average, State
 from dior_rt.training.triplets import Batches, load_views
 
 STATE: Final = "state.safetensors"  # what a run resumes from
-LORA_TARGETS: Final = ["qkv", "proj", "up", "down", "modulation", "unembed"]
 
 Progress = Callable[[int, float], None]  # step, running loss
-Prepare = Callable[[dict[str, Tensor]], dict[str, Tensor]]
+Batch = dict[str, Tensor]
+Prepare = Callable[[Batch], Batch]
+Stream = Callable[[int, int], IterableDataset[Batch]]  # (number of the first batch, process) -> batches
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def fit(renders: Path, out: Path, config: Config, plan: Plan, progress: Progress
         assert isinstance(network, Mini)
         save_network(network, out / WEIGHTS)
 
-    _run(Mini(config), renders, out, plan, progress, save)
+    run(Mini(config), rendered(renders, plan), out, plan, progress, save)
 
 
 def fit_lora(
@@ -83,25 +85,28 @@ def fit_lora(
     Resumes and raises like `fit`.
     """
     torch.manual_seed(plan.seed)
-    lora = LoraConfig(r=rank, lora_alpha=rank, target_modules=LORA_TARGETS)
-    adapted = get_peft_model(load_network(base), lora)  # type: ignore[arg-type]
-
-    def save(network: nn.Module) -> None:
-        assert isinstance(network, PeftModel)
-        save_network(load_network(base), out / WEIGHTS)
-        network.save_pretrained(str(out / LORA), safe_serialization=True)
-
-    _run(adapted, renders, out, plan, progress, save)
+    backbone = MiniLora(base, rank, out)
+    run(backbone.network, rendered(renders, plan), out, plan, progress, backbone.save)
 
 
-def flow_loss(network: nn.Module, batch: dict[str, Tensor], sigma: Tensor, noise: Tensor) -> Tensor:
-    """Mean squared error of x0 at flow times sigma (B,); the network sees (1 - sigma) x0 + sigma noise."""
+def rendered(renders: Path, plan: Plan) -> Stream:
+    """Triplets from a folder of renders; raises InputError where it holds none."""
+    views = load_views(renders)
+    return lambda start, rank: Batches(views, plan.batch, plan.seed, start, rank=rank)
+
+
+def flow_loss(network: nn.Module, batch: Batch, sigma: Tensor, noise: Tensor) -> Tensor:
+    """Mean squared error of x0 at flow times sigma (B,); the network sees (1 - sigma) x0 + sigma noise.
+
+    A batch may carry `weight` (B,), by which each sample's error counts.
+    """
     s = sigma[:, None, None, None]
     x0 = batch["x0"]
     x = (1 - s) * x0 + s * noise
     inputs = {name: batch[name] for name in ("photo", "light", "mask", "mode")}
     velocity = network(x=x, sigma=sigma, **inputs)
-    return (x - s * velocity - x0).square().mean()
+    errors = (x - s * velocity - x0).square().flatten(1).mean(dim=1)  # (B,)
+    return (errors * batch["weight"]).mean() if "weight" in batch else errors.mean()
 
 
 def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
@@ -111,9 +116,9 @@ def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
     return torch.where(torch.rand(count, generator=generator) < plan.always_noise, torch.ones(count), shifted)
 
 
-def _run(
+def run(
     network: nn.Module,
-    renders: Path,
+    stream: Stream,
     out: Path,
     plan: Plan,
     progress: Progress | None,
@@ -122,9 +127,9 @@ def _run(
 ) -> None:
     """Train to the plan's end; every so often `save` receives the network with its averaged weights.
 
-    prepare: makes of a batch of triplets what the network's data variable is.
+    prepare: makes of a batch of triplets what the network's data variable is. Resumes where `out` holds a
+    state; raises InputError for one that cannot be used, and where nothing can be written.
     """
-    views = load_views(renders)
     make_folder(out)
     accelerator = Accelerator(mixed_precision=plan.precision)
     trained = [weight for weight in network.parameters() if weight.requires_grad]
@@ -133,13 +138,15 @@ def _run(
     state = State(trained, optimizer, Average(trained, plan.average))
     if (out / STATE).exists():
         state.resume(out / STATE)
-    batches = Batches(views, plan.batch, plan.seed, state.step, rank=accelerator.process_index)
+    batches = stream(state.step, accelerator.process_index)
     # One process beside the training: several would each draw the same batches.
     loader = DataLoader(batches, batch_size=None, num_workers=1, prefetch_factor=4)
     running = math.nan
-    for batch in islice(loader, max(plan.steps - state.step, 0)):
+    for batch in islice(_told(loader), max(plan.steps - state.step, 0)):
         moved = {name: value.to(accelerator.device) for name, value in batch.items()}
-        loss = _step(accelerator, network, state, prepare(moved), plan)
+        with accelerator.autocast():
+            prepared = prepare(moved)
+        loss = _step(accelerator, network, state, prepared, plan)
         running = loss if math.isnan(running) else 0.98 * running + 0.02 * loss
         if progress:
             progress(state.step, running)
@@ -149,9 +156,15 @@ def _run(
             state.store(out / STATE)  # last: a run that was stopped in between saves its weights once more
 
 
-def _step(
-    accelerator: Accelerator, network: nn.Module, state: State, batch: dict[str, Tensor], plan: Plan
-) -> float:
+def _told(batches: Iterable[Batch]) -> Iterator[Batch]:
+    """The batches; what their process could not read is said without that process' traceback."""
+    try:
+        yield from batches
+    except InputError as error:
+        raise InputError(str(error).strip().rpartition("InputError: ")[2]) from error
+
+
+def _step(accelerator: Accelerator, network: nn.Module, state: State, batch: Batch, plan: Plan) -> float:
     """One step of the optimiser and of the average; returns the loss."""
     for group in state.optimizer.param_groups:
         group["lr"] = plan.rate_at(state.step)

@@ -25,7 +25,7 @@ from dior_rt.family.mini import MODES
 from dior_rt.family.qwen_config import LUMI_PEAK, LUMI_SCALE
 from dior_rt.family.qwen_frame import fit_area
 from dior_rt.files import make_folder, reason
-from dior_rt.training.fit import Plan, Progress, _run
+from dior_rt.training.fit import Plan, Progress, rendered, run
 from dior_rt.training.network import RELIT_SCALE, decode_light
 
 MULTIPLE: Final = 32
@@ -147,7 +147,7 @@ def fit_qwen_lora(
         network.save(out)
 
     network = Qwen(transformer, prompts, rank)
-    _run(network, renders, out, plan, progress, save, Pictures(vae, area).prepare)
+    run(network, rendered(renders, plan), out, plan, progress, save, Pictures(vae, area).prepare)
 
 
 @torch.no_grad()
