@@ -7,7 +7,7 @@ import numpy as np
 from dior_rt.kernels import draw
 from dior_rt.kernels.color import ENCODED_KNEE, LINEAR_KNEE, decode_table, encode_table
 from dior_rt.kernels.ops import Grid, Ops
-from dior_rt.kernels.resample import area_weights, bands, spline_taps
+from dior_rt.kernels.resample import FAINTEST, area_weights, bands, spline_taps
 from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA, rough_reciprocal
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
@@ -116,7 +116,7 @@ def _weighted(light: Picture, mask: Picture) -> FloatArray:
     if mask.dtype != np.float32:
         mask = mask * np.float32(1 / np.iinfo(mask.dtype).max)
     linear = light if light.dtype == np.float32 else decode_table(light.dtype)[light]
-    weight = mask[..., None]
+    weight = np.where(mask > 0, np.maximum(mask, np.float32(FAINTEST)), 0)[..., None]
     return np.concatenate([np.where(weight > 0, linear, np.float32(0)) * weight, weight], 2)
 
 

@@ -11,7 +11,7 @@ import pyopencl as cl
 from dior_rt.kernels import draw
 from dior_rt.kernels.color import decode_table, encode_table
 from dior_rt.kernels.ops import Grid, Ops
-from dior_rt.kernels.resample import bands
+from dior_rt.kernels.resample import FAINTEST, bands
 from dior_rt.kernels.session import Session
 from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, SIGMA
@@ -61,6 +61,7 @@ class OpenCLOps(Ops):
         # The floats of strokes are linear already.
         decode = "" if light.dtype == np.float32 else "DECODE"
         masked = {"MASK": SAMPLES[mask.dtype.name], "MASK_WHOLE": _whole(mask.dtype), "LIGHT": decode}
+        masked["FAINTEST"] = f"{FAINTEST}f"
         return self._reduce(self._kernel("sum_rows", light.dtype, **masked), light, mask, grid)
 
     def _reduce(self, sum_rows: cl.Kernel, picture: Picture, mask: Picture | None, grid: Grid) -> Strokes:

@@ -61,8 +61,8 @@ class Ops(ABC):
         """Full-size strokes -> strokes of the grid: the mean of light, weighted by mask and exact overlap.
 
         light (H, W, 3): integers are sRGB-encoded, floats linear. mask (H, W): integers span 0..1; it must
-        lie in 0..1. Light where the mask is 0 is never read into a result. The new mask is 1 in each cell
-        that anything specified touches, else 0.
+        lie in 0..1, and counts as at least 2^-60 where it is not 0. Light where the mask is 0 is never read
+        into a result. The new mask is 1 in each cell that anything specified touches, else 0.
         """
         light, mask = np.asarray(light), np.asarray(mask)
         _check_dtype("light", light)

@@ -1,6 +1,6 @@
 /* Exact area means: along the rows first, then down the columns of what that left. Built after curve.cl. With MASK, the
- * type of a mask whose MASK_WHOLE stands for 1, and LIGHT, how the light's samples are decoded, it is sum_rows of
- * strokes.
+ * type of a mask whose MASK_WHOLE stands for 1, FAINTEST, what a fainter mask counts as, and LIGHT, how the light's
+ * samples are decoded, it is sum_rows of strokes.
  *
  * Cell j of `cells` over `pixels` pixels spans j * pixels / cells .. (j + 1) * pixels / cells. Its ends are computed as
  * integers, in units of 1 / cells of a pixel: what a cell does not touch weighs exactly nothing.
@@ -25,6 +25,7 @@ inline Span span_of(int j, int pixels, int cells) {
 #define PIXEL(i) specified(picture + 3 * (i), table, (float)mask[i] / MASK_WHOLE)
 inline float4 specified(__global const SAMPLE *pixel, __global const float *table, float weight) {
   if (!(weight > 0.0f)) return (float4)(0.0f);
+  weight = weight > FAINTEST ? weight : FAINTEST;
   return weight * (float4)(LIGHT(pixel[0]), LIGHT(pixel[1]), LIGHT(pixel[2]), 1.0f);
 }
 #else

@@ -8,6 +8,9 @@ import numpy as np
 
 from dior_rt.kernels.types import FloatArray
 
+#: What a fainter mask counts as: sums of light weighted by it stay normal numbers, on every device.
+FAINTEST = 2.0**-60
+
 
 def bands(height: int, width: int, pixels: int) -> Iterator[slice]:
     """Slices of rows, in order, of about `pixels` pixels each and at least one row: memory stays bounded."""

@@ -1,0 +1,124 @@
+"""What was seen: every error that a test held to a bound, and the page of them.
+
+    pytest tests/stability -m "slow or not slow" --numerics docs/numerics.md
+
+A test says `hold(case, where, got, want, bound)`: the result is finite, and its largest difference to the
+float64 reference, by `scale`, is at most the bound.
+"""
+
+from __future__ import annotations
+
+import inspect
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import numpy.typing as npt
+import onnxruntime
+
+from dior_rt.kernels import KernelError, list_devices
+
+COMMAND = 'pytest tests/stability -m "slow or not slow" --numerics docs/numerics.md'
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The worst error of a case in one setting. where: the device, or the precision of the network."""
+
+    case: str
+    where: str
+    unit: str
+    bound: float
+    seen: float
+
+
+@dataclass
+class Ledger:
+    """The entries of every area, which is a test module; of one case and setting the worst is kept."""
+
+    areas: dict[str, dict[tuple[str, str], Entry]] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
+
+    def note(self, module: ModuleType, entry: Entry) -> None:
+        text = inspect.getdoc(module) or ""
+        self.texts[module.__name__] = text
+        area = self.areas.setdefault(module.__name__, {})
+        old = area.get((entry.case, entry.where))
+        if old is None or not entry.seen <= old.seen:
+            area[entry.case, entry.where] = entry
+
+    def page(self) -> str:
+        parts = [HEAD.format(command=COMMAND, machine=_machine())]
+        for name in sorted(self.areas):
+            title, _, text = self.texts[name].partition("\n")
+            parts.append(
+                f"## {title.rstrip('.')}\n\n{text.strip()}\n\n{_table([*self.areas[name].values()])}"
+            )
+        return "\n\n".join(part.replace("\n\n\n", "\n\n").strip() for part in parts) + "\n"
+
+
+HEAD = """# Numbers on hard cases
+
+Every case of `tests/stability`: its result is finite and in range, and its error against a float64 reference of
+the same computation stays within the bound. A cell is the largest error seen, then the bound in brackets; `exact` means
+that no difference is allowed and none was seen. This page is written by
+
+    {command}
+
+on {machine}"""
+
+
+def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
+    """`hold` for the tests of one module."""
+
+    def hold(
+        case: str,
+        where: str,
+        got: npt.ArrayLike,
+        want: npt.ArrayLike,
+        bound: float,
+        unit: str = "",
+        scale: npt.ArrayLike = 1.0,
+    ) -> None:
+        """Finite, and nowhere further from `want` than bound * scale; both are noted."""
+        got, want = np.asarray(got), np.asarray(want)
+        assert got.shape == want.shape, f"{case}: {got.shape} where {want.shape} is expected"
+        assert np.isfinite(got).all(), f"{case}, {where}: the result is not finite"
+        apart = np.abs(got.astype(np.float64) - want.astype(np.float64)) / scale
+        seen = float(apart.max(initial=0))
+        ledger.note(module, Entry(case, where, unit, bound, seen))
+        assert seen <= bound, f"{case}, {where}: off by {seen:.3g} {unit}; {bound:g} is allowed"
+
+    return hold
+
+
+def _table(entries: list[Entry]) -> str:
+    columns = list(dict.fromkeys(entry.where for entry in entries))
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for entry in entries:
+        cell = "exact" if entry.bound == 0 else f"{entry.seen:.1e} ({entry.bound:.0e})"
+        if entry.bound >= 0.1:
+            cell = f"{entry.seen:.2f} ({entry.bound:g})"
+        rows.setdefault((entry.case, entry.unit), {})[entry.where] = cell
+    lines = ["| case | error in | " + " | ".join(columns) + " |", "|---" * (2 + len(columns)) + "|"]
+    for (case, unit), cells in rows.items():
+        lines.append(f"| {case} | {unit} | " + " | ".join(cells.get(c, "") for c in columns) + " |")
+    return "\n".join(lines)
+
+
+def _machine() -> str:
+    try:
+        devices = [f"opencl:{device.index} = {device.name}, {device.platform}" for device in list_devices()]
+    except KernelError:
+        devices = []
+    versions = f"Python {platform.python_version()}, NumPy {np.__version__}"
+    return "; ".join(
+        [f"{platform.machine()} with {versions}, ONNX Runtime {onnxruntime.__version__}", *devices]
+    )
+
+
+def write(ledger: Ledger, path: Path) -> None:
+    path.write_text(ledger.page(), encoding="utf-8")
