@@ -16,12 +16,11 @@ LORA_TARGETS: Final = ["qkv", "proj", "up", "down", "modulation", "unembed"]
 
 
 class Backbone(Protocol):
-    """A model in training.
+    """A model in training."""
 
-    network: called with x, sigma, photo, light, mask and mode, it gives the velocity of x.
-    """
-
-    network: nn.Module
+    @property
+    def network(self) -> nn.Module:
+        """Called with x, sigma, photo, light, mask and mode, it gives the velocity of x."""
 
     def prepare(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """A batch of triplets (see `triplets.example`), its x0 and inputs made the network's own."""
@@ -30,7 +29,7 @@ class Backbone(Protocol):
         """x0 of estimate mode -> the Lumi maps that it means, (B, 3, h, w) of the grid, linear >= 0."""
 
     def save(self, network: nn.Module) -> None:
-        """Write the network as it is exported later; it may have other weights than `self.network` now."""
+        """Write the network as it is exported later; it holds the weights' average then."""
 
 
 class MiniLora:

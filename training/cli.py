@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from dior_rt.cli.extras import needs_extra
+from dior_rt.errors import InputError
+
 app = typer.Typer(no_args_is_help=True, help="Render scenes and train the network (needs dior-rt[train]).")
 
 
 Precision = Annotated[Literal["no", "bf16"], typer.Option(help="bf16 where the processor or GPU has it.")]
+Side = Annotated[int, typer.Option(min=32, help="Qwen: pixels a side of a square picture; others as many.")]
 
 
 @app.callback()
@@ -87,33 +89,121 @@ def lora(
         fit_lora(base, renders, out, rank, plan, bar.show)
 
 
+@app.command()
+def qwen_lora(
+    model: Annotated[Path, typer.Argument(help="Qwen-Image-Edit as diffusers has it.")],
+    renders: Annotated[Path, typer.Argument(help="Folder of renders.")],
+    out: Annotated[Path, typer.Option(help="Folder of the LoRA; a run that stopped goes on from it.")],
+    rank: Annotated[int, typer.Option(min=1)] = 64,
+    steps: Annotated[int, typer.Option(min=1)] = 15000,
+    batch: Annotated[int, typer.Option(min=1)] = 8,
+    rate: Annotated[float, typer.Option(min=0)] = 1e-4,
+    side: Side = 512,
+    precision: Precision = "no",
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+) -> None:
+    """Train a LoRA on Qwen-Image-Edit with the same triplets and loss (needs dior-rt[qwen]).
+
+    `dior-rt export MODEL --lora OUT/pytorch_lora_weights.safetensors --prompt-cache` merges it.
+    """
+    with needs_extra("qwen", command="train qwen-lora"):
+        from dior_rt.training.fit import Plan
+        from dior_rt.training.qwen import fit_qwen_lora
+
+        plan = Plan(steps, batch, rate, seed=seed, precision=precision)
+        with _Bar(steps) as bar:
+            fit_qwen_lora(model, renders, out, rank, plan, area=side**2, progress=bar.show)
+
+
+@app.command()
+def stage2(
+    base: Annotated[
+        Path,
+        typer.Argument(
+            help="model.safetensors of a trained network, or Qwen-Image-Edit as diffusers has it."
+        ),
+    ],
+    renders: Annotated[Path, typer.Argument(help="Folder of renders.")],
+    pairs: Annotated[
+        Path, typer.Argument(help="Folder of scenes: PAIRS/<scene>/<photo>, photos of one view.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder of the LoRA; a run that stopped goes on from it.")],
+    photos: Annotated[
+        str, typer.Option(metavar="PATTERN", help="Which files of a scene are its photos.")
+    ] = "*",
+    rendered_weight: Annotated[
+        float, typer.Option(min=0, help="Of the loss on renders beside real pairs.")
+    ] = 1.0,
+    estimate_steps: Annotated[int, typer.Option(min=1, help="Of the flow, to the light of a target.")] = 1,
+    rank: Annotated[int, typer.Option(min=1)] = 64,
+    steps: Annotated[int, typer.Option(min=1)] = 500,
+    batch: Annotated[int, typer.Option(min=2, help="Even; half of it is real pairs.")] = 32,
+    rate: Annotated[float, typer.Option(min=0)] = 5e-5,
+    start: Annotated[Path | None, typer.Option(metavar="FILE", help="Qwen: the LoRA of stage 1.")] = None,
+    side: Side = 512,
+    precision: Precision = "no",
+    seed: Annotated[int, typer.Option(min=0)] = 2,
+) -> None:
+    """Train a LoRA on real photos and renders at once.
+
+    A real pair is two photos of one view under different light. The model estimates the light of one, and
+    has to relight the other with strokes cut from that estimate.
+    """
+    from dior_rt.training.backbone import Backbone, MiniLora
+    from dior_rt.training.fit import Plan
+    from dior_rt.training.stage2 import Mixture, fit_stage2, load_scenes
+
+    plan = Plan(steps, batch, rate, warmup=50, seed=seed, precision=precision)
+    is_qwen = (base / "model_index.json").is_file()
+    if start and not is_qwen:
+        raise InputError(f"{base} is no Qwen-Image-Edit, and --start is for that.")
+
+    def make() -> Backbone:
+        if not is_qwen:
+            return MiniLora(base, rank, out)
+        with needs_extra("qwen", command="train stage2"):
+            from dior_rt.training.qwen import QwenLora, dtype_of
+
+            return QwenLora(base, out, rank, None, side**2, start, dtype_of(plan))
+
+    with _Bar(steps) as bar:
+        mixture = Mixture(rendered_weight, estimate_steps)
+        fit_stage2(make, renders, load_scenes(pairs, photos), out, plan, mixture, bar.show)
+
+
 @app.command(name="eval")
 def evaluate(
-    bundle: Annotated[Path, typer.Argument(help="Folder of the bundle.")],
-    renders: Annotated[Path, typer.Argument(help="Folder of renders that training has not seen.")],
-    views: Annotated[int, typer.Option(min=1, help="How many views at most.")] = 80,
+    method: Annotated[Path, typer.Argument(help="Folder of a bundle, or of another method's pictures.")],
+    benchmark: Annotated[
+        Path, typer.Argument(help="Renders that training has not seen, or SynthBench, MultiIllum, ReNe.")
+    ],
+    views: Annotated[int, typer.Option(min=1, help="How many pairs of each kind at most.")] = 80,
+    dabs: Annotated[int, typer.Option(min=0, help="On renders: how many views the brush visits.")] = 10,
     steps: Annotated[int | None, typer.Option(min=1, help="Also with so many steps.")] = None,
     guidance: Annotated[float | None, typer.Option(min=0, help="Also with this guidance.")] = None,
     noise_scale: Annotated[float | None, typer.Option(min=0, help="Also from noise so strong.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of a table.")] = False,
+    lpips: Annotated[bool, typer.Option("--lpips", help="Also LPIPS (needs dior-rt[lpips]).")] = False,
+    photos: Annotated[Path | None, typer.Option(help="Photos to look for patch borders in.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for report.json, report.md and contact.png.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
 ) -> None:
-    """Measure how well a bundle relights held-out renders, beside copying the source.
+    """Measure how well a bundle relights, beside baselines, and how it answers to the brush.
 
-    With the bundle's own settings, and once more with those given.
+    With the bundle's own settings, and once more with those given. Pictures of another method are called
+    {task}.png; a name that is missing is told.
     """
-    from dior_rt.relight import Relighter
-    from dior_rt.training.evaluate import Settings, evaluate, markdown
-    from dior_rt.training.triplets import load_views
+    from dior_rt.training.evaluation.methods import Settings
+    from dior_rt.training.evaluation.report import as_json as to_json
+    from dior_rt.training.evaluation.report import markdown, write_report
+    from dior_rt.training.evaluation.run import Plan, evaluate
 
-    relighter, held_out = Relighter(bundle), load_views(renders)[:views]
-    asked = dict.fromkeys(
-        [Settings(), Settings(steps, guidance, noise_scale)]
-    )  # once where they are the same
-    evaluations = [evaluate(relighter, held_out, settings) for settings in asked]
-    if as_json:
-        typer.echo(json.dumps([asdict(evaluation) for evaluation in evaluations], indent=2))
-    else:
-        typer.echo("\n\n".join(markdown(evaluation) for evaluation in evaluations))
+    plan = Plan(views, dabs, lpips, photos)
+    evaluations, examples = evaluate(method, benchmark, Settings(steps, guidance, noise_scale), plan)
+    if out:
+        write_report(out, evaluations, examples)
+    typer.echo(to_json(evaluations) if as_json else markdown(evaluations))
 
 
 class _Bar:

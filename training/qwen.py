@@ -1,10 +1,8 @@
-"""A LoRA on Qwen-Image-Edit, trained with the same triplets, loss and loop as mini.
+"""A LoRA on Qwen-Image-Edit, trained with the same triplets, losses, loop and stages as mini.
 
-The loop knows a backbone by two things: `prepare`, which turns a batch of triplets into the backbone's data
-variable and inputs, and a network that is called with x, sigma, photo, light, mask and mode. Here the data
-variable is the latents of the picture to be painted, photo and light are the latents of the two references,
-and the network is diffusers' transformer with peft's LoRA. The prompts are embedded once, without pictures,
-so the LoRA belongs in a bundle with a prompt cache.
+It is a `Backbone`: its data variable is the latents of the picture to be painted, photo and light are the
+latents of the two references, and the network is diffusers' transformer with peft's LoRA. The prompts are
+embedded once, without pictures, so the LoRA belongs in a bundle with a prompt cache.
 """
 
 from __future__ import annotations
@@ -15,7 +13,10 @@ from typing import Any, Final
 
 import torch
 from diffusers import AutoencoderKLQwenImage, QwenImageEditPlusPipeline, QwenImageTransformer2DModel
-from peft import LoraConfig, get_peft_model_state_dict
+from diffusers.training_utils import cast_training_params
+from peft import LoraConfig, get_peft_model_state_dict, set_peft_model_state_dict
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 from transformers import Qwen2_5_VLForConditionalGeneration, Qwen2Tokenizer
@@ -24,11 +25,14 @@ from dior_rt.errors import InputError
 from dior_rt.family.mini import MODES
 from dior_rt.family.qwen_config import LUMI_PEAK, LUMI_SCALE
 from dior_rt.family.qwen_frame import fit_area
-from dior_rt.files import make_folder, reason
+from dior_rt.family.qwen_words import SKIP, TEMPLATE, Prompts
+from dior_rt.files import reason
+from dior_rt.training.backbone import resample
 from dior_rt.training.fit import Plan, Progress, rendered, run
 from dior_rt.training.network import RELIT_SCALE, decode_light
 
 MULTIPLE: Final = 32
+SAID: Final = {MODES["relight"]: Prompts.relight, MODES["estimate"]: Prompts.estimate}
 ADAPTER: Final = "light"
 TARGETS: Final = [
     *(f"to_{role}" for role in ("q", "k", "v", "out.0", "add_out")),
@@ -57,6 +61,7 @@ class Qwen(nn.Module):
             init_lora_weights="gaussian",
         )
         self.transformer.add_adapter(self.lora, adapter_name=ADAPTER)
+        cast_training_params(self.transformer)  # to float32, whatever the weights beneath are held in
         self.prompts = nn.ParameterDict({str(k): nn.Parameter(v, False) for k, v in prompts.items()})
 
     def forward(
@@ -79,6 +84,18 @@ class Qwen(nn.Module):
             return_dict=False,
         )[0][0, : rows * columns // 4]
         return unpack(velocity, rows // 2, columns // 2)
+
+    def load(self, path: Path) -> None:
+        """Take up a LoRA that `save` wrote. Raises InputError for any other."""
+        try:
+            weights = {key.removeprefix("transformer."): value for key, value in load_file(path).items()}
+            wanted = get_peft_model_state_dict(self.transformer, adapter_name=ADAPTER)
+            shapes = ({key: value.shape for key, value in each.items()} for each in (weights, wanted))
+            if next(shapes) != next(shapes):
+                raise ValueError("it is of other layers, or of another rank")
+        except (OSError, SafetensorError, ValueError) as error:
+            raise InputError(f"Cannot go on from the LoRA {path}: {reason(error)}.") from error
+        set_peft_model_state_dict(self.transformer, weights, adapter_name=ADAPTER)
 
     def save(self, folder: Path) -> None:
         """Write the LoRA as diffusers reads it, pytorch_lora_weights.safetensors with its settings."""
@@ -109,15 +126,70 @@ class Pictures:
         latents = {"x0": painted, "photo": photo, "light": light}
         return {**batch, **{name: self.encode(picture) for name, picture in latents.items()}}
 
+    def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
+        """Latents of drawn light -> the light on a grid, (B, 3, h, w), linear."""
+        return resample(undraw(self.decode(x0)), grid)
+
     @torch.no_grad()
     def encode(self, pictures: Tensor) -> Tensor:
         """sRGB 0..1 (B, 3, h, w), resized to the area -> latents (B, z, h', w'), normalised."""
         size = fit_area(self.area, pictures.shape[2], pictures.shape[3], MULTIPLE)
         self.vae.to(pictures.device)
-        pictures = pictures.to(self.vae.dtype).clamp(0, 1)
-        pixels = F.interpolate(pictures, size, mode="bicubic", antialias=True).clamp(0, 1)
-        latents = self.vae.encode(2 * pixels[:, :, None] - 1).latent_dist.mode()[:, :, 0]
+        with torch.autocast(pictures.device.type, enabled=False):
+            pixels = F.interpolate(pictures.float().clamp(0, 1), size, mode="bicubic", antialias=True)
+            latents = self.vae.encode(2 * pixels.clamp(0, 1)[:, :, None] - 1).latent_dist.mode()[:, :, 0]
         return (latents - self.mean.to(latents)) / self.std.to(latents)
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Tensor:
+        """The inverse of `encode`, at the size of the area."""
+        self.vae.to(latents.device)
+        with torch.autocast(latents.device.type, enabled=False):
+            z = latents.float() * self.std.to(latents.device) + self.mean.to(latents.device)
+            pixels = self.vae.decode(z[:, :, None]).sample[:, :, 0]
+        return ((pixels + 1) / 2).clamp(0, 1)
+
+
+class QwenLora:
+    """The `Backbone`: a diffusers folder with a LoRA in training, which the folder `out` receives."""
+
+    def __init__(
+        self,
+        folder: Path,
+        out: Path,
+        rank: int,
+        prompts: dict[int, Tensor] | None = None,
+        area: int = 512**2,
+        start: Path | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        """prompts: mode -> embeddings (T, D); None takes those of the words that an export says. area: pixels
+        of the pictures. start: a LoRA that training goes on from. dtype: of the weights beneath the LoRA.
+
+        Raises InputError for a folder that is no such model, and for a LoRA that is none of `save`.
+        """
+        prompts = prompts or embed_prompts(folder)
+        try:
+            transformer = QwenImageTransformer2DModel.from_pretrained(
+                folder / "transformer", torch_dtype=dtype
+            )
+            vae = AutoencoderKLQwenImage.from_pretrained(folder / "vae")
+        except (OSError, ValueError, RuntimeError) as error:
+            raise InputError(f"Cannot read the model in {folder}: {reason(error)}.") from error
+        self.out, self.pictures = out, Pictures(vae, area)
+        self.network = Qwen(transformer, prompts, rank)
+        if start:
+            self.network.load(start)
+
+    def prepare(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        return self.pictures.prepare(batch)
+
+    def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
+        return self.pictures.lumi(x0, grid)
+
+    def save(self, network: nn.Module) -> None:
+        assert isinstance(network, Qwen)
+        network.save(self.out)
 
 
 def fit_qwen_lora(
@@ -126,33 +198,28 @@ def fit_qwen_lora(
     out: Path,
     rank: int,
     plan: Plan,
-    prompts: dict[int, Tensor],
+    prompts: dict[int, Tensor] | None = None,
     area: int = 512**2,
     progress: Progress | None = None,
 ) -> None:
     """Train a LoRA on a diffusers folder of Qwen-Image-Edit; `out` receives it, and a state to resume from.
 
-    prompts: mode -> embeddings (T, D), as `embed_prompts` makes them. Raises InputError.
+    Arguments and errors are those of `QwenLora` and `fit`.
     """
     torch.manual_seed(plan.seed)
-    try:
-        transformer = QwenImageTransformer2DModel.from_pretrained(folder / "transformer")
-        vae = AutoencoderKLQwenImage.from_pretrained(folder / "vae")
-    except (OSError, ValueError, RuntimeError) as error:
-        raise InputError(f"Cannot read the model in {folder}: {reason(error)}.") from error
-    make_folder(out)
+    stream = rendered(renders, plan)  # before the weights, which take minutes to read
+    backbone = QwenLora(folder, out, rank, prompts, area, dtype=dtype_of(plan))
+    run(backbone.network, stream, out, plan, progress, backbone.save, backbone.prepare)
 
-    def save(network: nn.Module) -> None:
-        assert isinstance(network, Qwen)
-        network.save(out)
 
-    network = Qwen(transformer, prompts, rank)
-    run(network, rendered(renders, plan), out, plan, progress, save, Pictures(vae, area).prepare)
+def dtype_of(plan: Plan) -> torch.dtype:
+    """Of the weights that are not trained."""
+    return torch.bfloat16 if plan.precision == "bf16" else torch.float32
 
 
 @torch.no_grad()
-def embed_prompts(folder: Path, said: dict[int, str], template: str, skip: int) -> dict[int, Tensor]:
-    """The embeddings (T, D) of each mode's prompt in the model's template, less its first `skip` words.
+def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor]:
+    """The embeddings (T, D) of each mode's prompt in the model's template, less its first words.
 
     Raises InputError where the folder has no text encoder.
     """
@@ -163,15 +230,20 @@ def embed_prompts(folder: Path, said: dict[int, str], template: str, skip: int) 
         raise InputError(f"Cannot read the text encoder in {folder}: {reason(error)}.") from error
     embeddings = {}
     for mode, words in said.items():
-        tokens = tokenizer(template.format(words), return_tensors="pt")
+        tokens = tokenizer(TEMPLATE.format(words), return_tensors="pt")
         hidden = encoder(**tokens, output_hidden_states=True).hidden_states[-1]
-        embeddings[mode] = hidden[0, skip:].clone()
+        embeddings[mode] = hidden[0, SKIP:].float()
     return embeddings
 
 
 def draw(light: Tensor) -> Tensor:
     """Light as a picture 0..1, as the runtime draws it: log(1 + 8 L) / log(1 + 8 peak)."""
     return (torch.log1p(LUMI_SCALE * light) / math.log1p(LUMI_SCALE * LUMI_PEAK)).clamp(0, 1)
+
+
+def undraw(picture: Tensor) -> Tensor:
+    """The inverse of `draw`, as the runtime has it."""
+    return torch.expm1(picture * math.log1p(LUMI_SCALE * LUMI_PEAK)) / LUMI_SCALE
 
 
 def pack(latents: Tensor) -> Tensor:

@@ -57,6 +57,12 @@ def export(
         Path | None,
         typer.Option(metavar="FILE", help="Qwen: the transformer's weights in one safetensors file."),
     ] = None,
+    vae: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Qwen: the autoencoder's weights, likewise.")
+    ] = None,
+    text_encoder: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Qwen: the text encoder's weights, likewise.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bundle at BUNDLE.")] = False,
     debug: options.Debug = False,
 ) -> None:
@@ -79,6 +85,7 @@ def export(
         with needs_extra("qwen", command="export"):
             from dior_rt.export.qwen.bundle import Recipe, export_qwen
             from dior_rt.export.qwen.lora import Lora
+            from dior_rt.export.qwen.sources import Files
 
             recipe = Recipe(precision=weights, steps=steps, free_steps=free_steps, prompt_cache=prompt_cache)
             bundle = export_qwen(
@@ -86,12 +93,13 @@ def export(
                 out,
                 recipe.few_steps(few_steps) if few_steps else recipe,
                 loras=[Lora(*_path_and_strength(one)) for one in lora],
-                transformer=transformer,
+                files=Files(transformer, vae, text_encoder),
                 overwrite=overwrite,
                 progress=_show,
             )
     else:
-        if few_steps or free_steps or prompt_cache or transformer or weights in ("int8", "int4"):
+        files = transformer or vae or text_encoder
+        if few_steps or free_steps or prompt_cache or files or weights in ("int8", "int4"):
             raise InputError(f"{source} is no Qwen-Image-Edit, and these options are for that.")
         if len(lora) > 1:
             raise InputError("A checkpoint of training takes one LoRA.")

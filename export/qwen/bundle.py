@@ -19,13 +19,15 @@ from dior_rt.export.qwen.errors import check_block, compare
 from dior_rt.export.qwen.graph import Precision
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.export.qwen.modulation import tabulate, write_modulation
-from dior_rt.export.qwen.sources import MULTIPLE, Prompts, Sources
+from dior_rt.export.qwen.parity import check_text_layer, check_vae
+from dior_rt.export.qwen.sources import IN_FOLDER, MULTIPLE, Files, Sources
 from dior_rt.export.qwen.text import write_text_encoder
 from dior_rt.export.qwen.transformer import THETA, write_transformer
 from dior_rt.export.qwen.vae import write_decoder, write_encoder
 from dior_rt.family.qwen_config import FILE, LUMI_PEAK, MODULATION, PROMPTS, QwenSettings, TextSettings
 from dior_rt.family.qwen_layers import Layers
 from dior_rt.family.qwen_prompt import PromptEncoder
+from dior_rt.family.qwen_words import Prompts
 from dior_rt.records import unparse
 from dior_rt.sampler import Array
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
@@ -77,25 +79,25 @@ def export_qwen(
     recipe: Recipe,
     *,
     loras: Sequence[Lora] = (),
-    transformer: Path | None = None,
+    files: Files = IN_FOLDER,
     overwrite: bool = False,
     progress: Progress = lambda part: None,
 ) -> Bundle:
     """Write the bundle of a diffusers folder at `out`.
 
-    transformer: a file of weights in place of the folder's. progress: told of each part when it is written.
+    files: of weights in place of the folder's. progress: told of each part when it is written.
     Raises InputError for what cannot be exported, ExportError where a graph computes something else than
     torch, and BundleError where nothing can be written. Nothing is left at `out` then.
     """
     check_target(out, overwrite)
-    sources = Sources(folder, loras, transformer)
+    sources = Sources(folder, loras, files)
     schedule = recipe.schedule or sources.schedule()
     _check_room(sources, recipe, out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as scratch:
             draft = _Draft(Path(scratch) / "draft", sources, recipe, schedule, progress)
-            parity = {"block": draft.worst_block, "one_step": 0.0, "all_steps": 0.0}
+            parity = {**draft.parity, "one_step": 0.0, "all_steps": 0.0}
             if recipe.precision != "fp32":
                 exact = replace(recipe, precision="fp32")
                 reference = _Draft(Path(scratch) / "fp32", sources, exact, schedule, progress)
@@ -117,12 +119,13 @@ class _Draft:
         schedule: ShiftSchedule | DynamicShiftSchedule,
         progress: Progress,
     ) -> None:
-        """Write everything; see `export_qwen`. worst_block: the largest error of a block against torch."""
+        """Write everything; see `export_qwen`. parity: the errors of the parts against torch's."""
         self.folder, self.sources, self.recipe, self.schedule = folder, sources, recipe, schedule
         self._progress = progress
         self._graphs: dict[str, Graph] = {}
         self._extra: list[str] = []
-        self.worst_block = self._write_transformer()
+        self.parity: dict[str, float] = {}
+        self._write_transformer()
         self._write_vae()
         fixed = self._write_modulation()
         settings = self._settings(fixed, self._write_text())
@@ -146,23 +149,22 @@ class _Draft:
             if (self.folder / name).is_file()
         }
 
-    def _write_transformer(self) -> float:
+    def _write_transformer(self) -> None:
         config, weights, precision = (
             self.sources.transformer,
             self.sources.transformer_weights,
             self.recipe.precision,
         )
-        worst = 0.0
         for name, graph in write_transformer(self._new("transformer"), config, weights, precision):
             path = self._add("transformer", name, graph)
             if name.startswith("block"):
-                worst = max(worst, check_block(path, config, weights, int(name[-2:]), precision))
-        return worst
+                self._worst("block", check_block(path, config, weights, int(name[-2:]), precision))
 
     def _write_vae(self) -> None:
         folder, config, weights = self._new("vae"), self.sources.vae, self.sources.vae_weights
         self._add("vae", "encoder", write_encoder(folder / "encoder.onnx", config, weights))
         self._add("vae", "decoder", write_decoder(folder / "decoder.onnx", config, weights))
+        self.parity |= check_vae(folder, self.sources.vae_config, weights)
 
     def _write_modulation(self) -> tuple[float, ...]:
         """The graphs, or for a bundle of fixed steps their table; returns the sigmas that it is for."""
@@ -201,7 +203,10 @@ class _Draft:
         for name, graph in write_text_encoder(
             self._new("text"), sources.text, sources.text_weights, precision
         ):
-            self._add("text", name, graph)
+            path = self._add("text", name, graph)
+            error = check_text_layer(path, sources.text, sources.text_weights, name, precision)
+            if error is not None:
+                self._worst(name.rpartition(".")[0].replace(".", "_"), error)
         if not cache:
             np.savez(self.folder / PROMPTS, ids=np.array(known), rows=rows)
             return settings
@@ -248,6 +253,9 @@ class _Draft:
             parity={},
             settings={},
         )
+
+    def _worst(self, figure: str, error: float) -> None:
+        self.parity[figure] = max(error, self.parity.get(figure, 0.0))
 
     def _new(self, name: str) -> Path:
         folder = self.folder / name

@@ -15,41 +15,42 @@ from dior_rt.errors import InputError
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.export.qwen.text import TextConfig
 from dior_rt.export.qwen.transformer import TransformerConfig
-from dior_rt.export.qwen.vae import VaeConfig
+from dior_rt.export.qwen.vae import VaeConfig, vae_names
 from dior_rt.export.qwen.weights import Checkpoint, Merged, read_config
 from dior_rt.family.qwen_config import TextSettings, VisionSettings
+from dior_rt.family.qwen_words import PICTURE, SKIP, TEMPLATE
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 MULTIPLE: Final = 32
 
-# The words around every prompt that the model was trained with; the embeddings of the first 64 are dropped.
-TEMPLATE: Final = (
-    "<|im_start|>system\n"
-    "Describe the key features of the input image (color, shape, size, texture, objects, background), then "
-    "explain how the user's text instruction should alter or modify the image. Generate a new image that "
-    "meets the user's requirements while maintaining consistency with the original input where appropriate."
-    "<|im_end|>\n<|im_start|>user\n{}<|im_end|>\n<|im_start|>assistant\n"
-)
-SKIP: Final = 64
-PICTURE: Final = "Picture {}: <|vision_start|><|image_pad|><|vision_end|>"
+
+@dataclass(frozen=True)
+class Files:
+    """Safetensors files of whole parts, as they are also handed on, in place of those in the folder."""
+
+    transformer: Path | None = None
+    vae: Path | None = None
+    text_encoder: Path | None = None
+
+
+IN_FOLDER: Final = Files()
 
 
 class Sources:
-    """The parts of a model on disk. Files may also be named one by one, where a part is not in the folder."""
+    """The parts of a model on disk: a diffusers folder, of whose parts the weights may lie elsewhere."""
 
-    def __init__(self, folder: Path, loras: Sequence[Lora] = (), transformer: Path | None = None) -> None:
-        """transformer: a safetensors file with the transformer's weights, in place of the folder's.
-
-        Raises InputError for a folder that is no such model, and for LoRAs that do not fit it.
-        """
+    def __init__(self, folder: Path, loras: Sequence[Lora] = (), files: Files = IN_FOLDER) -> None:
+        """Raises InputError for a folder that is no such model, and for LoRAs that do not fit it."""
         if not folder.is_dir():
             raise InputError(f"There is no model folder at {folder}.")
         self.folder = folder
         self.transformer = TransformerConfig.read(folder / "transformer" / "config.json")
-        self.transformer_base = Checkpoint(transformer or folder / "transformer")
+        self.transformer_base = Checkpoint(files.transformer or folder / "transformer")
         self.transformer_weights = Merged(self.transformer_base, loras)
-        self.vae = VaeConfig.read(folder / "vae" / "config.json")
-        self.vae_weights = Checkpoint(folder / "vae")
+        self.vae_config = folder / "vae" / "config.json"
+        self.vae = VaeConfig.read(self.vae_config)
+        self.vae_weights = Checkpoint(files.vae or folder / "vae", vae_names)
+        self._text_file = files.text_encoder or folder / "text_encoder"
 
     @cached_property
     def text(self) -> TextConfig:
@@ -57,7 +58,7 @@ class Sources:
 
     @cached_property
     def text_weights(self) -> Checkpoint:
-        return Checkpoint(self.folder / "text_encoder")
+        return Checkpoint(self._text_file)
 
     def schedule(self) -> ShiftSchedule | DynamicShiftSchedule:
         """The scheduler's; InputError where it is none that the runtime has."""
@@ -127,27 +128,6 @@ class Sources:
         if ids.count(self._picture_id()) != pictures:
             raise InputError(f"The tokenizer of {self.folder} does not know the word for a picture.")
         return ids
-
-
-@dataclass(frozen=True)
-class Prompts:
-    """What is said to the model in each mode; relight shows it two pictures, estimate one."""
-
-    relight: str = (
-        "Relight Picture 1 with the light that is drawn in Picture 2. Keep the viewpoint, the shapes, the "
-        "materials and the people. Where Picture 2 is black, the light is free."
-    )
-    estimate: str = "Draw the light that falls on every surface of Picture 1, as if all were white and matte."
-    negative: str = " "
-
-    def each(self) -> dict[str, tuple[str, int]]:
-        """By the name that the runtime uses: the words, and how many pictures come with them."""
-        return {
-            "relight": (self.relight, 2),
-            "relight_negative": (self.negative, 2),
-            "estimate": (self.estimate, 1),
-            "estimate_negative": (self.negative, 1),
-        }
 
 
 def _schedule(found: dict[str, Any]) -> ShiftSchedule | DynamicShiftSchedule:

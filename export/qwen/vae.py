@@ -11,10 +11,12 @@ the first frame.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from diffusers.loaders.single_file_utils import convert_wan_vae_to_diffusers
 
 from dior_rt.bundle import Graph
 from dior_rt.errors import InputError
@@ -47,6 +49,11 @@ class VaeConfig:
             )
         except (KeyError, TypeError) as error:
             raise InputError(f"{path} describes no AutoencoderKLQwenImage: {error}.") from error
+
+
+def vae_names(keys: Iterable[str]) -> dict[str, str]:
+    """The keys of an autoencoder's file -> diffusers' names; those of Wan, its origin, differ."""
+    return {key: name for name, key in convert_wan_vae_to_diffusers({key: key for key in keys}).items()}
 
 
 def write_encoder(path: Path, config: VaeConfig, weights: Checkpoint) -> Graph:

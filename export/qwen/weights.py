@@ -36,13 +36,23 @@ class Weights(Protocol):
     def __getitem__(self, name: str) -> Array: ...
 
 
+def plain_names(keys: Iterable[str]) -> dict[str, str]:
+    """Keys -> names as in diffusers' folders."""
+    return {key: _plain(key) for key in keys}
+
+
 class Checkpoint:
     """The tensors of a safetensors file, or of a folder of them with diffusers' or transformers' index."""
 
-    def __init__(self, path: Path) -> None:
-        """Raises InputError where there are no weights at `path`, or shards are missing or cut short."""
+    def __init__(self, path: Path, names: Callable[[Iterable[str]], dict[str, str]] = plain_names) -> None:
+        """names: the files' keys -> the tensors' names.
+
+        Raises InputError where there are no weights at `path`, or shards are missing or cut short.
+        """
         self.path = path
-        self._places = {_plain(key): (file, key) for file in _shards(path) for key in _keys(file)}
+        self._places = {
+            name: (file, key) for file in _shards(path) for key, name in names(_keys(file)).items()
+        }
 
     @property
     def names(self) -> Iterable[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from dior_rt.errors import BundleError, DiorError, InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.graph import GraphWriter
 from dior_rt.export.qwen.lora import Lora
-from dior_rt.export.qwen.sources import Sources
+from dior_rt.export.qwen.sources import Files, Sources
 from dior_rt.family.qwen import Qwen
 from dior_rt.schedule import ShiftSchedule
 
@@ -99,6 +100,11 @@ def test_every_bundle_tells_what_its_precision_costs(make):
         p: read_bundle(make(precision=p, steps=6)).manifest.parity for p in ("fp32", "fp16", "int8", "int4")
     }
     assert parity["fp32"]["block"] < 1e-5 and parity["fp32"]["one_step"] == 0
+    for part in ("vae_encoder", "vae_decoder", "text_block", "vision_block"):
+        assert 0 < parity["fp32"][part] < 1e-5
+    for part in ("text_block", "vision_block"):
+        costs = [parity[p][part] for p in ("fp32", "fp16", "int8", "int4")]
+        assert costs == sorted(costs) and costs[1] > 1e-5
     for figure in ("block", "one_step", "all_steps"):
         costs = [parity[p][figure] for p in ("fp32", "fp16", "int8", "int4")]
         assert costs == sorted(costs) and len(set(costs)) == 4
@@ -133,9 +139,65 @@ def test_one_file_of_weights_may_stand_in_for_the_folders(folders, pipes, tmp_pa
     save_file({f"model.diffusion_model.{name}": tensor for name, tensor in tensors.items()}, single)
     folder = tmp_path / "model"
     shutil.copytree(folders[True], folder, ignore=shutil.ignore_patterns("diffusion_pytorch_model*0*"))
-    qwen = Qwen(export_qwen(folder, tmp_path / "bundle", RECIPE, transformer=single), "cpu")
+    qwen = Qwen(export_qwen(folder, tmp_path / "bundle", RECIPE, files=Files(single)), "cpu")
     got, want = call_both(qwen, pipes[True], 0.3, 5, [(4, 4), (4, 4)])
     assert np.abs(got - want).max() <= 1e-4 * np.abs(want).max()
+
+
+def as_wan_names(name):
+    """The name of an autoencoder's tensor where diffusers did not rename it."""
+    layers = {"norm1": "residual.0", "conv1": "residual.2", "norm2": "residual.3", "conv2": "residual.6"}
+    for part, index in layers.items():
+        name = re.sub(rf"(blocks\.\d+|resnets\.\d+)\.{part}\.", rf"\1.{index}.", name)
+    name = name.replace("conv_shortcut", "shortcut").replace("down_blocks", "downsamples")
+    name = re.sub(r"mid_block\.resnets\.(\d)", lambda m: f"middle.{2 * int(m[1])}", name)
+    name = name.replace("mid_block.attentions.0", "middle.1").replace("conv_in", "conv1")
+    name = name.replace("norm_out", "head.0").replace("conv_out", "head.2")
+    name = re.sub(r"up_blocks\.(\d)\.resnets\.(\d)", lambda m: f"upsamples.{4 * int(m[1]) + int(m[2])}", name)
+    name = re.sub(r"up_blocks\.(\d)\.upsamplers\.0", lambda m: f"upsamples.{4 * int(m[1]) + 3}", name)
+    return re.sub(r"^quant_conv", "conv1", re.sub(r"^post_quant_conv", "conv2", name))
+
+
+def whole(folder):
+    """The tensors of all shards."""
+    return {
+        name: tensor for shard in folder.glob("*.safetensors") for name, tensor in load_file(shard).items()
+    }
+
+
+def test_every_part_may_come_in_a_file_of_its_own(folders, make, tmp_path):
+    # As they are handed on: the transformer under a prefix, the autoencoder in Wan's names, the text encoder
+    # with the language model's head; and a folder of settings alone.
+    renamed = {
+        "transformer": "model.diffusion_model.{}".format,
+        "vae": as_wan_names,
+        "text_encoder": str,
+    }
+    files = {}
+    for part, rename in renamed.items():
+        tensors = {rename(name): tensor for name, tensor in whole(folders[True] / part).items()}
+        files[part] = tmp_path / f"{part}.safetensors"
+        save_file(tensors, files[part])
+    settings = tmp_path / "model"
+    shutil.copytree(folders[True], settings, ignore=shutil.ignore_patterns("*.safetensors*"))
+    bundle = export_qwen(settings, tmp_path / "bundle", RECIPE, files=Files(**files))
+    assert bundle.manifest.files == read_bundle(make()).manifest.files  # byte for byte
+
+
+def test_a_part_that_is_nowhere_is_named(folder, tmp_path):
+    for shard in (folder / "vae").glob("*.safetensors"):
+        shard.unlink()
+    refuse(folder, tmp_path, "vae should hold one safetensors file", InputError)
+    refuse(
+        folder, tmp_path, "is cut short or is no safetensors", InputError, files=Files(vae=tmp_path / "none")
+    )
+
+
+def test_weights_in_eight_bits_are_refused(folder, tmp_path):
+    path = tmp_path / "fp8.safetensors"
+    tensors = {n: t.to(torch.float8_e4m3fn) for n, t in whole(folder / "transformer").items()}
+    save_file(tensors, path)
+    refuse(folder, tmp_path, "needs float32, float16 or bfloat16", InputError, files=Files(path))
 
 
 def test_weights_stored_as_bfloat16_are_read_as_what_they_are(folders, tmp_path):

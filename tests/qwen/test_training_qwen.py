@@ -11,7 +11,6 @@ from agreement_qwen import AREA, RECIPE, call_both
 from dior_rt.errors import InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.lora import Lora
-from dior_rt.export.qwen.sources import SKIP, TEMPLATE
 from dior_rt.family.mini import MODES
 from dior_rt.family.qwen import Qwen
 from dior_rt.kernels import Strokes
@@ -52,7 +51,7 @@ def smooth(random, side=128):
 
 @pytest.fixture(scope="module")
 def prompts(folders):
-    return training.embed_prompts(folders[True], SAID, TEMPLATE, SKIP)
+    return training.embed_prompts(folders[True], SAID)
 
 
 @pytest.fixture(scope="module")
@@ -172,4 +171,4 @@ def test_a_folder_that_is_no_model_is_refused(renders, prompts, tmp_path):
         training.fit_qwen_lora(tmp_path, renders, tmp_path / "out", 4, Plan(steps=1), prompts)
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="Cannot read the text encoder"):
-        training.embed_prompts(tmp_path, SAID, TEMPLATE, SKIP)
+        training.embed_prompts(tmp_path, SAID)
