@@ -12,14 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dior_rt.adaptive import sample_within
 from dior_rt.bundle import MOST_STEPS, Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
 from dior_rt.family import Family
 from dior_rt.family.mini import Mini
 from dior_rt.family.qwen import Qwen
+from dior_rt.family.qwen_frame import shrink
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
-from dior_rt.sampler import Array, draw_noise, sample
+from dior_rt.presets import ALWAYS, Sampling, sampling
+from dior_rt.sampler import Array, State, Velocity, between, draw_noise, sample
+from dior_rt.schedule import ShiftSchedule
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
@@ -43,16 +47,22 @@ class Relit:
     """A relit photo and how it came about.
 
     picture: of the photo's kind, dtype and size. notice: what the person should know, or None.
-    seconds: by stage (kernels, steps, transfer). steps, guidance, seed, intensity: as used.
+    seconds: by stage (kernels, steps, transfer). steps: as many as were taken. sampling, seed, intensity:
+    as used.
     """
 
     picture: Picture
     notice: str | None
     seconds: dict[str, float]
     steps: int
-    guidance: float
+    sampling: Sampling
     seed: int
     intensity: float
+
+    @property
+    def guidance(self) -> float:
+        """The scale that was used."""
+        return self.sampling.guidance
 
 
 class Relighter:
@@ -91,8 +101,13 @@ class Relighter:
         photo: Picture,
         strokes: Strokes | Sequence[Stroke] | Picture,
         *,
+        preset: str | None = None,
         steps: int | None = None,
+        solver: str | None = None,
+        shift: float | None = None,
         guidance: float | None = None,
+        interval: tuple[float, float] | None = None,
+        tolerance: float | None = None,
         seed: int = 0,
         intensity: float = 1.0,
         progress: Progress | None = None,
@@ -103,30 +118,41 @@ class Relighter:
         strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
         sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
         Stroke, in pixels of the photo.
-        steps, guidance: None takes the model's own. intensity: multiplies the light, >= 0.
-        progress: called after each step with (step, steps); returning False stops with Cancelled.
+        preset: "reference", or a faster one of the model's own, "balanced" or "fast"; see `Relighter.presets`.
+        steps, solver, shift, guidance, interval, tolerance: each goes over the preset's where it is not None;
+        see `Sampling`. intensity: multiplies the light, >= 0.
+        progress: called after each step with (step, steps), of which it passes several at a time where the
+        solver chooses its own; returning False stops with Cancelled.
 
         Raises InputError for what cannot be used, and DeviceError where a device fails.
         """
-        manifest = self.bundle.manifest
-        steps = manifest.steps if steps is None else steps
-        guidance = manifest.guidance if guidance is None else guidance
-        _check_settings(steps, guidance, seed, intensity)
+        how = sampling(
+            self.bundle,
+            preset,
+            steps=steps,
+            solver=solver,
+            shift=shift,
+            guidance=guidance,
+            interval=interval,
+            tolerance=tolerance,
+        )
+        _check_seed(seed)
+        _check_intensity(intensity)
         watch = Stopwatch()
         pixels = read_pixels(photo)
         raster = self._family.raster(*pixels.shape[:2])
         drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
         if not drawn.mask.any():
-            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, steps, guidance, seed, intensity)
+            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity)
         source, encoded = self._reduce_photo(pixels, raster)
         watch.lap("kernels")
         condition = self._family.encode(encoded, drawn, "relight")
-        x0 = self._sample(condition, steps, guidance, seed, progress)
+        x0, taken = self._sample(condition, how, seed, progress)
         watch.lap("steps")
         relit = self._ops.decode_srgb(self._family.decode_relit(x0, condition))
         picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
         watch.lap("transfer")
-        return Relit(picture, None, watch.seconds, steps, guidance, seed, intensity)
+        return Relit(picture, None, watch.seconds, taken, how, seed, intensity)
 
     @_device_errors()
     def estimate(
@@ -136,15 +162,19 @@ class Relighter:
 
         Arguments and errors are those of `relight`.
         """
-        steps = self.bundle.manifest.steps if steps is None else steps
-        _check_settings(steps, 1.0, seed, 1.0)
+        how = sampling(self.bundle, steps=steps, guidance=1.0)
+        _check_seed(seed)
         pixels = read_pixels(photo)
         _, encoded = self._reduce_photo(pixels, self._family.raster(*pixels.shape[:2]))
         condition = self._family.encode(encoded, None, "estimate")
-        return self._family.decode_lumi(self._sample(condition, steps, 1.0, seed, progress), condition)
+        x0, _ = self._sample(condition, how, seed, progress)
+        return self._family.decode_lumi(x0, condition)
 
     def _reduce_photo(self, pixels: NDArray, raster: tuple[int, int]) -> tuple[Array, Array]:
-        """The photo on its light grid, linear and sRGB-encoded 0..1."""
+        """The photo on its raster, linear and sRGB-encoded 0..1."""
+        if self.bundle.manifest.grid is None:  # what paints whole pictures has learnt from such as these
+            seen = shrink(pixels, raster)
+            return self._ops.decode_srgb(seen), seen
         source = self._ops.reduce_photo(pixels, raster)
         return source, np.clip(self._ops.encode_srgb(source, np.float32), 0, 1)
 
@@ -183,17 +213,38 @@ class Relighter:
         return self._ops.draw_strokes(drawn, canvas)
 
     def _sample(
-        self, condition: Any, steps: int, guidance: float, seed: int, progress: Progress | None
-    ) -> Array:
-        """The state at the end of the flow."""
-        family = self._family
-        sigmas = family.sigmas(steps, condition)
-        noise = draw_noise(seed, family.noise_shape(condition))
+        self, condition: Any, how: Sampling, seed: int, progress: Progress | None
+    ) -> tuple[Array, int]:
+        """The state at the end of the flow, and how many steps led there."""
+        noise = draw_noise(seed, self._family.noise_shape(condition))
         noise *= np.float32(self.bundle.manifest.noise_scale)
-        for state in sample(family.velocity(condition, sigmas, guidance), noise, sigmas):
+        for taken, state in enumerate(self._states(condition, how, noise), start=1):
             if progress and progress(state.step, state.steps) is False:
                 raise Cancelled(f"Stopped after step {state.step} of {state.steps}.")
-        return state.x
+        return state.x, taken
+
+    def _states(self, condition: Any, how: Sampling, noise: Array) -> Iterator[State]:
+        if how.tolerance is None:
+            sigmas = self._sigmas(condition, how.steps, how.shift)
+            return sample(self._velocity(condition, sigmas, how), noise, sigmas, how.solver)
+        family, sigmas = self._family, self._sigmas(condition, MOST_STEPS, how.shift)
+
+        def distance(one: Array, other: Array) -> float:
+            """RMS of the light grid's pictures, sRGB-encoded 0..1."""
+            pictures = (family.decode_relit(x0, condition).astype(np.float64) for x0 in (one, other))
+            return float(np.sqrt(np.mean(np.subtract(*pictures) ** 2)))
+
+        velocity = self._velocity(condition, sigmas, how)
+        return sample_within(how.tolerance, distance, velocity, noise, sigmas)
+
+    def _sigmas(self, condition: Any, steps: int, shift: float | None) -> Array:
+        return ShiftSchedule(shift).sigmas(steps) if shift else self._family.sigmas(steps, condition)
+
+    def _velocity(self, condition: Any, sigmas: Array, how: Sampling) -> Velocity:
+        guided = self._family.velocity(condition, sigmas, how.guidance)
+        if how.interval == ALWAYS or how.guidance == 1:
+            return guided
+        return between(*how.interval, guided, self._family.velocity(condition, sigmas, 1.0))
 
 
 def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:
@@ -203,12 +254,11 @@ def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]
     return Qwen(bundle, device, threads)
 
 
-def _check_settings(steps: int, guidance: float, seed: int, intensity: float) -> None:
-    if not 1 <= steps <= MOST_STEPS:
-        raise InputError(f"steps must lie between 1 and {MOST_STEPS}, not {steps}.")
-    if not (math.isfinite(guidance) and guidance >= 0):
-        raise InputError(f"guidance must be a number of at least 0, not {guidance}.")
+def _check_intensity(intensity: float) -> None:
     if not (math.isfinite(intensity) and intensity >= 0):
         raise InputError(f"intensity must be a number of at least 0, not {intensity}.")
+
+
+def _check_seed(seed: int) -> None:
     if seed < 0:
         raise InputError(f"seed must be at least 0, not {seed}.")

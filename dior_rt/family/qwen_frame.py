@@ -56,6 +56,17 @@ class Frame:
         return canvas[top : top + rows, left : left + columns]
 
 
+def shrink(pixels: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
+    """A picture (h, w, 3), sRGB, uint8, uint16 or float32, brought to a size by Lanczos; 0..1.
+
+    8 bits stay 8 bits on the way: that is the picture that diffusers' processor shows the model.
+    """
+    if pixels.dtype == np.uint8:
+        return resize(pixels, size, Image.Resampling.LANCZOS) / np.float32(255)
+    whole = np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)
+    return resize(pixels / whole, size, Image.Resampling.LANCZOS).clip(0, 1)
+
+
 def resize(pixels: NDArray, size: tuple[int, int], method: Image.Resampling) -> NDArray:
     """Resize (h, w, 3), uint8 or float32, to (rows, columns) as Pillow does; to its own size, not at all."""
     if pixels.shape[:2] == size:
