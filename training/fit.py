@@ -1,7 +1,7 @@
 """The training loop: stage 1 from nothing, or a LoRA on top of it. One loop, whatever is being trained.
 
 Loss: the squared error of x0, which for relighting is the squared error of the relit sRGB picture (times 16)
-and for estimation that of the encoded Lumi map. Half of the samples are drawn at sigma = 1, where the whole
+and for estimation that of the encoded Lumi map. Most of the samples are drawn at sigma = 1, where the whole
 answer has to come from the condition; the others at sigmas shifted towards it.
 """
 
@@ -49,11 +49,11 @@ class Plan:
     rate: float = 8e-4
     warmup: int = 200
     decay: float = 0.2
-    average: int = 150
+    average: int = 300
     weight_decay: float = 0.02
     clip: float = 1.0
     shift: float = 8.0
-    always_noise: float = 0.5
+    always_noise: float = 0.6
     seed: int = 0
     precision: Literal["no", "bf16"] = "no"
     save_every: int = 200
@@ -133,7 +133,9 @@ def run(
     make_folder(out)
     accelerator = Accelerator(mixed_precision=plan.precision)
     trained = [weight for weight in network.parameters() if weight.requires_grad]
-    optimizer = torch.optim.AdamW(trained, lr=plan.rate, betas=(0.9, 0.99), weight_decay=plan.weight_decay)
+    optimizer = torch.optim.AdamW(
+        trained, lr=plan.rate, betas=(0.9, 0.99), weight_decay=plan.weight_decay, fused=True
+    )
     network, optimizer = accelerator.prepare(network.train(), optimizer)
     state = State(trained, optimizer, Average(trained, plan.average))
     if (out / STATE).exists():

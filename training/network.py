@@ -14,6 +14,7 @@ import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -31,25 +32,31 @@ LORA = "lora"
 FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
 RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
+BOUNCED = 0.05  # b: light that reaches a place where no source shines, so that drawn darkness is no black hole
 SMALLEST_SIGMA = 1e-3
 
 
 @dataclass(frozen=True)
 class Config:
-    """The network's size. width: of a token, a multiple of 4 heads; patch: a token's side, in cells.
+    """The network's size. width: of a token, a multiple of 4 heads; patch: a token's side, in cells, a multiple
+    of 4; fine, half, quarter: features of a cell, of 2 x 2, and of 4 x 4 cells.
 
-    Raises InputError for a width that the heads do not divide so.
+    Raises InputError for a width that the heads do not divide so, and for such a patch.
     """
 
     width: int = 256
     depth: int = 6
     heads: int = 8
     patch: int = 8
-    features: int = 24  # a cell, between the transformer and the output's convolutions
+    fine: int = 16
+    half: int = 64
+    quarter: int = 128
 
     def __post_init__(self) -> None:
         if self.width % (4 * self.heads):
             raise InputError(f"The width must be a multiple of 4 times the heads; {self.width} is none.")
+        if self.patch % 4:
+            raise InputError(f"The patch must be a multiple of 4; {self.patch} is none.")
 
 
 def srgb_to_linear(encoded: Tensor) -> Tensor:
@@ -75,53 +82,115 @@ def decode_light(encoded: Tensor) -> Tensor:
     return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
 
 
+class Features(NamedTuple):
+    """What does not depend on the flow. given: photo, photo in linear light, its light if it were white paper
+    (encoded), the log of the drawn light, mask; then what convolutions see in cells, 2 x 2, and 4 x 4 cells."""
+
+    given: Tensor  # (B, 13, h, w)
+    fine: Tensor  # (B, 16, h, w)
+    half: Tensor  # (B, 64, h / 2, w / 2)
+    quarter: Tensor  # (B, 128, h / 4, w / 4)
+    tokens: Tensor  # (B, width, h / patch, w / patch)
+
+
 class Mini(nn.Module):
-    """photo, strokes, noisy state -> velocity. Inputs and output as in docs/contracts.md."""
+    """photo, strokes, noisy state -> velocity. Inputs and output as in docs/contracts.md.
+
+    `encode` looks at photo and strokes, once a picture; `step` is what every step of the flow costs.
+    """
 
     def __init__(self, config: Config) -> None:
         super().__init__()
         self.config = config
         width, patch = config.width, config.patch
-        self.embed = nn.Conv2d(10, width, patch, patch)
+        fine, half, quarter = config.fine, config.half, config.quarter
+        self.see = nn.Conv2d(10, fine, 3, padding=1)
+        self.see_half = nn.Conv2d(fine, half, 4, 2, 1)
+        self.see_quarter = nn.Conv2d(half, quarter, 4, 2, 1)
+        self.embed = nn.Conv2d(quarter, width, patch // 4, patch // 4)
+        self.embed_state = nn.Conv2d(3, width, patch, patch)
         self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.mode = nn.Embedding(2, width)
         self.modulation = nn.Linear(width, 6 * width)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
-        self.unembed = nn.Linear(width, config.features * patch * patch)
-        self.smooth = nn.Conv2d(config.features + 10, config.features, 3, padding=1)
-        self.head = nn.Conv2d(config.features, 6, 3, padding=1)
-        for silent in (self.modulation, self.head):
+        self.unembed = nn.Linear(width, quarter * (patch // 4) ** 2)
+        self.blend_quarter = Blend(quarter, half)
+        self.blend_half = Blend(half, fine)
+        self.see_state = nn.Conv2d(3, fine, 3, padding=1)
+        self.state_gate = nn.Linear(width, fine)
+        self.smooth = nn.Conv2d(fine, fine, 3, padding=1)
+        self.head = nn.Conv2d(fine, 6, 3, padding=1)
+        for silent in (self.modulation, self.state_gate, self.head):
             for weight in silent.parameters():
                 nn.init.zeros_(weight)
 
     def forward(
         self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
     ) -> Tensor:
-        x0 = self.predict(x, sigma, photo, light, mask, mode)
+        return self.step(x, sigma, mode, *self.encode(photo, light, mask))
+
+    def encode(self, photo: Tensor, light: Tensor, mask: Tensor) -> Features:
+        """What photo and strokes say, whatever the flow's state."""
+        linear = srgb_to_linear(photo)
+        white, aim = encode_light(linear), torch.log(light + BOUNCED)
+        start = aim - torch.log(linear + BOUNCED)  # where the light would have to go on white paper
+        seen = torch.cat([2 * photo - 1, encode_light(light) * mask, start * mask, mask], dim=1)
+        fine = F.silu(self.see(seen))
+        half = F.silu(self.see_half(fine))
+        quarter = F.silu(self.see_quarter(half))
+        given = torch.cat([photo, linear, white, aim, mask], dim=1)
+        return Features(given, fine, half, quarter, self.embed(quarter))
+
+    def step(
+        self,
+        x: Tensor,
+        sigma: Tensor,
+        mode: Tensor,
+        given: Tensor,
+        fine: Tensor,
+        half: Tensor,
+        quarter: Tensor,
+        tokens: Tensor,
+    ) -> Tensor:
+        """The velocity at x and sigma, with what `encode` made of photo and strokes."""
+        condition = F.silu(self.time(waves(sigma, self.config.width)) + self.mode(mode))  # (B, width)
+        cells = self._transform(tokens + self.embed_state(x), condition)  # (B, 128, h / 4, w / 4)
+        cells = self.blend_quarter(cells + quarter)  # (B, 64, h / 2, w / 2)
+        cells = self.blend_half(cells + half)  # (B, 16, h, w)
+        # Near noise the state says nothing, near the image it says all: the gate follows sigma.
+        state = self.see_state(x) * self.state_gate(condition)[:, :, None, None]
+        cells = F.silu(self.smooth(cells + fine + state))
+        raw, own = self.head(cells).float().chunk(2, dim=1)  # (B, 3, h, w)
+        photo, linear, white, aim, mask = given.split((3, 3, 3, 3, 1), dim=1)
+        own = white + own  # the photo's own light, encoded; of white paper it is the photo itself
+        # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
+        ratio = raw + mask * (aim - torch.log(decode_light(own) + BOUNCED))
+        relit = _relight(photo, linear, ratio)
+        x0 = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
         return (x - x0) / sigma.clamp_min(SMALLEST_SIGMA)[:, None, None, None]
 
-    def predict(
-        self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
-    ) -> Tensor:
-        """x0, (B, 3, h, w)."""
-        seen = torch.cat([x, 2 * photo - 1, encode_light(light) * mask, mask], dim=1)  # (B, 10, h, w)
-        cells = self._cells(seen, sigma, mode)
-        relit, lumi = self.head(F.silu(self.smooth(torch.cat([cells, seen], dim=1)))).float().chunk(2, dim=1)
-        return torch.where(mode[:, None, None, None] == 0, _relight(photo, relit), _estimate(photo, lumi))
-
-    def _cells(self, seen: Tensor, sigma: Tensor, mode: Tensor) -> Tensor:
-        """The transformer's features of every cell, (B, features, h, w)."""
-        patch = self.config.patch
-        tokens = self.embed(seen)  # (B, width, rows, columns)
+    def _transform(self, tokens: Tensor, condition: Tensor) -> Tensor:
+        """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells."""
         rows, columns = tokens.shape[2:]
-        turns = rotations(rows, columns, self.config.width // self.config.heads, seen.device)
+        turns = rotations(rows, columns, self.config.width // self.config.heads, tokens.device)
         tokens = tokens.flatten(2).transpose(1, 2)  # (B, rows * columns, width)
-        condition = self.time(waves(sigma, self.config.width)) + self.mode(mode)
-        modulation = self.modulation(F.silu(condition)).unflatten(1, (6, -1))  # (B, 6, width)
+        modulation = self.modulation(condition).unflatten(1, (6, -1))  # (B, 6, width)
         for block in self.blocks:
             tokens = block(tokens, modulation, turns)
-        cells = self.unembed(F.layer_norm(tokens, tokens.shape[-1:]))
-        return F.pixel_shuffle(cells.transpose(1, 2).unflatten(2, (rows, columns)), patch)
+        cells = self.unembed(_norm(tokens))
+        return F.pixel_shuffle(cells.transpose(1, 2).unflatten(2, (rows, columns)), self.config.patch // 4)
+
+
+class Blend(nn.Module):
+    """Neighbouring cells blended, so that no borders show, then each made four."""
+
+    def __init__(self, size: int, finer: int) -> None:
+        super().__init__()
+        self.blend = nn.Conv2d(size, size, 3, padding=1)
+        self.divide = nn.Conv2d(size, 4 * finer, 1)
+
+    def forward(self, cells: Tensor) -> Tensor:
+        return F.pixel_shuffle(self.divide(F.silu(self.blend(cells))), 2)
 
 
 class Block(nn.Module):
@@ -190,16 +259,12 @@ def rotate(part: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
     return torch.cat([a * cosine - b * sine, a * sine + b * cosine], dim=-1)
 
 
-def _relight(photo: Tensor, raw: Tensor) -> Tensor:
-    ratio = 6 * torch.tanh(raw / 6)  # at most 400 times the light, or a 400th
-    relit = (srgb_to_linear(photo) + FLOOR) * torch.exp(ratio) - FLOOR
+def _relight(photo: Tensor, linear: Tensor, ratio: Tensor) -> Tensor:
+    ratio = 6 * torch.tanh(ratio / 6)  # at most 400 times the light, or a 400th
+    relit = (linear + FLOOR) * torch.exp(ratio) - FLOOR
     # What lies outside the display's range is shown clipped, but a little slope keeps it trainable.
     shown = relit.clamp(0, 1)
     return RELIT_SCALE * (linear_to_srgb(shown) + 0.05 * (relit - shown).clamp(-1, 1) - photo)
-
-
-def _estimate(photo: Tensor, raw: Tensor) -> Tensor:
-    return 2 * (encode_light(srgb_to_linear(photo)) + raw) - 1
 
 
 def save_network(network: Mini, path: Path) -> None:

@@ -12,7 +12,7 @@ from dior_rt.training.network import Config, Mini
 def random_mini() -> Mini:
     """Weights that all take part: a new network has silent layers."""
     torch.manual_seed(0)
-    network = Mini(Config(width=48, depth=2, heads=4, patch=4, features=8))
+    network = Mini(Config(width=48, depth=2, heads=4, patch=4, fine=4, half=8, quarter=16))
     with torch.no_grad():
         for name, weight in network.named_parameters():
             if not weight.any() or name.startswith("head"):

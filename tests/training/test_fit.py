@@ -15,7 +15,7 @@ from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_lo
 from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network
 from dior_rt.training.triplets import Batches
 
-TINY = Config(width=32, depth=1, heads=2, patch=8, features=8)
+TINY = Config(width=32, depth=1, heads=2, patch=8, fine=4, half=8, quarter=16)
 SHORT = Plan(steps=6, batch=2, rate=2e-3, warmup=2, average=2, save_every=2)
 
 

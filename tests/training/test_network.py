@@ -23,7 +23,7 @@ from dior_rt.training.network import (
     srgb_to_linear,
 )
 
-SMALL = Config(width=32, depth=1, heads=2, patch=4, features=4)
+SMALL = Config(width=32, depth=1, heads=2, patch=4, fine=4, half=8, quarter=16)
 
 
 def inputs(rows: int = 8, columns: int = 12, batch: int = 3, seed: int = 0) -> dict[str, torch.Tensor]:
@@ -42,6 +42,11 @@ def inputs(rows: int = 8, columns: int = 12, batch: int = 3, seed: int = 0) -> d
     }
 
 
+def found(network: Mini, given: dict[str, torch.Tensor]) -> torch.Tensor:
+    """x0, the answer that the velocity points at."""
+    return given["x"] - given["sigma"][:, None, None, None] * network(**given)
+
+
 @pytest.fixture
 def awake() -> Mini:
     """A small network all of whose weights take part."""
@@ -53,21 +58,26 @@ def awake() -> Mini:
     return network.eval()
 
 
-def test_untrained_it_returns_the_photo_and_takes_the_photo_for_light() -> None:
+@torch.no_grad()
+def test_untrained_it_keeps_the_photo_where_nothing_is_drawn_and_takes_the_photo_for_light() -> None:
     network, given = Mini(SMALL), inputs()
-    with torch.no_grad():
-        np.testing.assert_allclose(network.predict(**given), 0, atol=1e-5)
-        given["mode"] += 1
-        expected = 2 * encode_light(srgb_to_linear(given["photo"])) - 1
-        torch.testing.assert_close(network.predict(**given), expected)
+    silent = (given["mask"] == 0).expand(-1, 3, -1, -1)
+    np.testing.assert_allclose(found(network, given)[silent], 0, atol=1e-5)
+    given["mode"] += 1
+    expected = 2 * encode_light(srgb_to_linear(given["photo"])) - 1
+    torch.testing.assert_close(found(network, given), expected, atol=1e-5, rtol=1e-5)
 
 
 @torch.no_grad()
-def test_velocity_and_x0_are_one_answer(awake) -> None:
-    given = inputs()
-    s = given["sigma"][:, None, None, None]
-    x0 = given["x"] - s * awake(**given)
-    torch.testing.assert_close(x0, awake.predict(**given), atol=1e-4, rtol=1e-4)
+def test_untrained_it_already_follows_the_drawn_light() -> None:
+    network, given = Mini(SMALL), inputs()
+    given["photo"], given["mask"] = 0.3 + 0 * given["photo"], 1 + 0 * given["mask"]
+    given["light"] = 0.02 + 0.03 * given["light"]
+    light = [given["light"], 2 * given["light"]]
+    relit = [srgb_to_linear(given["photo"] + found(network, {**given, "light": drawn}) / 4) for drawn in light]
+    lit = [torch.log(one + module.FLOOR) for one in relit]
+    ratio = torch.log((light[1] + module.BOUNCED) / (light[0] + module.BOUNCED))
+    torch.testing.assert_close(lit[1] - lit[0], ratio, atol=0.02, rtol=0.02)
 
 
 @torch.no_grad()
@@ -90,14 +100,14 @@ def test_pictures_of_a_batch_do_not_mix(awake) -> None:
 @torch.no_grad()
 def test_every_input_matters_but_light_that_is_not_specified(awake) -> None:
     given = inputs()
-    base = awake.predict(**given)
+    base = found(awake, given)
     for name, other in inputs(seed=1).items():
         if name in ("sigma", "mode"):
             other = 1 - given[name]
-        changed = awake.predict(**{**given, name: other})
+        changed = found(awake, {**given, name: other})
         assert (changed - base).abs().max() > 1e-3, name
     hidden = given["light"] + 5 * (1 - given["mask"])
-    assert torch.equal(awake.predict(**{**given, "light": hidden}), base)
+    assert torch.equal(found(awake, {**given, "light": hidden}), base)
 
 
 @torch.no_grad()
@@ -105,7 +115,7 @@ def test_every_cell_sees_the_whole_grid(awake) -> None:
     given = inputs(16, 16, 1)
     moved = {**given, "photo": given["photo"].clone()}
     moved["photo"][..., :4, :4] = 0
-    far = (awake.predict(**moved) - awake.predict(**given))[..., 12:, 12:]
+    far = (found(awake, moved) - found(awake, given))[..., 12:, 12:]
     assert far.abs().max() > 1e-5
 
 
@@ -124,13 +134,13 @@ def test_positions_enter_attention_by_their_distance_alone() -> None:
 def test_relit_light_stays_physical(awake) -> None:
     given = inputs()
     with torch.no_grad():
-        awake.head.bias.fill_(50.0)
-        bright = given["photo"] + awake.predict(**given) / 4
-        awake.head.bias.fill_(-50.0)
-        dark = given["photo"] + awake.predict(**given) / 4
+        awake.head.bias[:3] = 50.0
+        bright = given["photo"] + found(awake, given) / 4
+        awake.head.bias[:3] = -50.0
+        dark = given["photo"] + found(awake, given) / 4
     assert bright.clamp(0, 1).min() > 0.99 and dark.clamp(0, 1).max() < 0.01
     black = torch.zeros(1, 3, 4, 4)
-    assert (module._relight(black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
+    assert (module._relight(black, black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
 
 
 def test_colour_is_the_kernels_colour() -> None:
@@ -198,3 +208,5 @@ def test_what_is_no_network_is_refused_in_a_sentence(awake, tmp_path) -> None:
 def test_a_width_that_the_heads_do_not_divide_is_refused() -> None:
     with pytest.raises(InputError, match="multiple of 4 times the heads"):
         Config(width=100, heads=8)
+    with pytest.raises(InputError, match="patch must be a multiple of 4"):
+        Config(patch=6)
