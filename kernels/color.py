@@ -48,16 +48,19 @@ def decode_table(dtype: np.dtype[np.unsignedinteger]) -> FloatArray:
 class EncodeTable:
     """Rounds linear float32 to the nearest sRGB code without computing a power, exactly.
 
-    A float's upper bits name a bucket so narrow that at most one rounding threshold lies in it. Of a value x,
-    clipped to floor..1: bucket = (bits(x) >> shift) - first; code = start[bucket]; and one more where
-    x >= threshold[code]. threshold[k] is the smallest float32 that rounds to code k + 1.
+    A float's upper bits name a bucket so narrow that at most one border between two codes lies in it. With
+    bits(x) those of x, clipped to floor..1, all in 32-bit integers that wrap around,
+
+        code = (entry[(bits(x) >> shift) - first] + bits(x)) >> shift
+
+    entry is the bucket's lower code << shift, less the bits at which the bucket begins, plus as much as lets
+    the sum carry into the next code from the border on.
     """
 
     shift: int
     first: int
     floor: np.float32
-    start: npt.NDArray[np.unsignedinteger]
-    threshold: FloatArray
+    entry: npt.NDArray[np.int32]
 
 
 @cache
@@ -65,13 +68,15 @@ def encode_table(dtype: np.dtype[np.unsignedinteger]) -> EncodeTable:
     """The table for uint8 or uint16."""
     top = int(np.iinfo(dtype).max)
     exact = srgb_to_linear((np.arange(top) + 0.5) / top)
-    threshold = exact.astype(np.float32)
-    threshold = np.where(threshold < exact, np.nextafter(threshold, np.float32(2)), threshold)
+    # border[k]: the bits of the smallest float32 that rounds to code k + 1. Bits rise as floats >= 0 do.
+    border = exact.astype(np.float32).view(np.int32)
+    border += border.view(np.float32) < exact
     shift = 16 if top == 255 else 8
     floor = np.float32(2.0 ** np.floor(np.log2(exact[0])))
-    first = int(floor.view(np.uint32)) >> shift
-    last = int(np.float32(1).view(np.uint32)) >> shift
-    buckets = (np.arange(first, last + 1, dtype=np.uint32) << np.uint32(shift)).view(np.float32)
-    start = np.searchsorted(threshold, buckets, side="right").astype(dtype)
-    threshold = np.append(threshold, np.float32(np.inf)).astype(np.float32)
-    return EncodeTable(shift, first, floor, start, threshold)
+    first = int(floor.view(np.int32)) >> shift
+    begin = np.arange(first, (int(np.float32(1).view(np.int32)) >> shift) + 1, dtype=np.int64) << shift
+    code = np.searchsorted(border, begin, side="right")
+    carry = begin + (1 << shift) - np.append(border, np.iinfo(np.int32).max)[code]
+    entry = ((code << shift) - begin + np.maximum(carry, 0)).astype(np.int32)
+    entry.setflags(write=False)
+    return EncodeTable(shift, first, floor, entry)

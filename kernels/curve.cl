@@ -1,7 +1,7 @@
 /* The sRGB curve of IEC 61966-2-1, for samples of one kind.
  *
  * Built with SAMPLE = uchar, ushort or float, and TOP = 255, 65535 or 0 (float). Integers are decoded through a table of
- * every code and encoded through a table of rounding thresholds: both are exact. Floats take the powers as
+ * every code and encoded through a table of buckets: both are exact. Floats take the powers as
  * exp2(p * log2(x)), from the two polynomials below.
  *
  * Loops over pixels call no built-in functions: PoCL does not inline its own, and a call keeps the compiler from
@@ -42,15 +42,14 @@ inline float srgb_of(float x) {
 }
 
 #if TOP
-#define DECODE(sample) table[sample]
-#define ENCODE(x) nearest_code(x, start, threshold)
+#define DECODE(sample) light_of[sample]
+#define ENCODE(x) nearest_code(x, code_of)
 
 /* The nearest code of x, exactly: see EncodeTable in color.py. NaN compares as less than FLOOR. */
-inline SAMPLE nearest_code(float x, __global const SAMPLE *start, __global const float *threshold) {
+inline SAMPLE nearest_code(float x, __global const int *code_of) {
   x = x > FLOOR ? x : FLOOR;
   x = x < 1.0f ? x : 1.0f;
-  int code = start[(as_int(x) >> SHIFT) - (as_int(FLOOR) >> SHIFT)];
-  return (SAMPLE)(code + (x >= threshold[code]));
+  return (SAMPLE)((code_of[(as_int(x) >> SHIFT) - (as_int(FLOOR) >> SHIFT)] + as_int(x)) >> SHIFT);
 }
 #else
 #define DECODE(sample) linear_of(sample)
@@ -58,14 +57,14 @@ inline SAMPLE nearest_code(float x, __global const SAMPLE *start, __global const
 #endif
 
 /* Item k: samples k * run .. of `size`. */
-__kernel void decode(__global const SAMPLE *restrict picture, __global const float *restrict table,
+__kernel void decode(__global const SAMPLE *restrict picture, __global const float *restrict light_of,
                      __global float *restrict linear, int size, int run) {
   int first = get_global_id(0) * run, stop = size - first < run ? size : first + run;
   for (int i = first; i < stop; ++i) linear[i] = DECODE(picture[i]);
 }
 
-__kernel void encode(__global const float *restrict linear, __global const SAMPLE *restrict start,
-                     __global const float *restrict threshold, __global SAMPLE *restrict picture, int size, int run) {
+__kernel void encode(__global const float *restrict linear, __global const int *restrict code_of,
+                     __global SAMPLE *restrict picture, int size, int run) {
   int first = get_global_id(0) * run, stop = size - first < run ? size : first + run;
   for (int i = first; i < stop; ++i) picture[i] = ENCODE(linear[i]);
 }

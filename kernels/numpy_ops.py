@@ -33,9 +33,8 @@ class NumpyOps(Ops):
             power = 1.055 * np.maximum(linear, np.float32(LINEAR_KNEE)) ** (1 / 2.4) - 0.055
             return np.where(linear <= LINEAR_KNEE, np.float32(12.92) * linear, power)
         table = encode_table(dtype)
-        clipped = np.fmin(np.fmax(linear, table.floor), np.float32(1))
-        code = table.start[(clipped.view(np.uint32) >> table.shift) - table.first]
-        return code + (clipped >= table.threshold[code])
+        bits = np.fmin(np.fmax(linear, table.floor), np.float32(1)).view(np.int32)
+        return ((table.entry[(bits >> table.shift) - table.first] + bits) >> table.shift).astype(dtype)
 
     def _reduce_photo(self, picture: Picture, grid: Grid) -> FloatArray:
         height, width = picture.shape[:2]
@@ -105,9 +104,10 @@ class NumpyOps(Ops):
                 weight = rough_reciprocal(1 + distance * distance) * (down[k, rows, None] * across[m])
                 near[3] = 1
                 total += weight * near
-            gain = np.moveaxis(np.exp2(total[:3] / total[3]) - 1, 0, 2)
+            q = np.moveaxis(total[:3] / total[3], 0, 2)
             linear = self._decode(photo[rows])
-            result[rows] = self._encode(linear + (linear + np.float32(EPSILON)) * gain, photo.dtype)
+            relit = linear + (linear + np.float32(EPSILON)) * (q * (q + 2))
+            result[rows] = self._encode(relit, photo.dtype)
         return result
 
 

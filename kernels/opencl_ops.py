@@ -41,18 +41,16 @@ class OpenCLOps(Ops):
 
     def _encode(self, linear: FloatArray, dtype: np.dtype) -> Picture:
         picture = np.empty(linear.shape, dtype)
-        self._map(self._kernel("encode", dtype), linear, picture, *self._encode_tables(dtype))
+        self._map(self._kernel("encode", dtype), linear, picture, self._encode_table(dtype))
         return picture
 
-    def _map(
-        self, kernel: cl.Kernel, given: np.ndarray, result: np.ndarray, *tables: cl.Buffer | None
-    ) -> None:
+    def _map(self, kernel: cl.Kernel, given: np.ndarray, result: np.ndarray, table: cl.Buffer | None) -> None:
         """Run an elementwise kernel from one array to another of the same shape."""
         session, flat, out = self._session, given.reshape(-1), result.reshape(-1)
         for band in bands(flat.size, 1, BAND):
             size = band.stop - band.start
             with session.output(out[band]) as buffer:
-                session.launch(kernel, size, 1, session.input(flat[band]), *tables, buffer, size)
+                session.launch(kernel, size, 1, session.input(flat[band]), table, buffer, size)
 
     def _reduce_photo(self, picture: Picture, grid: Grid) -> FloatArray:
         return self._reduce(self._kernel("sum_rows", picture.dtype), picture, None, grid).light
@@ -122,7 +120,8 @@ class OpenCLOps(Ops):
         rows, columns = nodes.shape[0] - 2, nodes.shape[1] - 2
         result = np.empty(photo.shape, photo.dtype)
         kernel = self._kernel("transfer", photo.dtype)
-        given = session.input(nodes), self._decode_table(photo.dtype)
+        tables = self._decode_table(photo.dtype), self._encode_table(photo.dtype)
+        given = session.input(nodes), *tables
         for band in bands(height, width, BAND):
             with session.output(result[band]) as out:
                 place = height, width, rows, columns, band.start
@@ -148,11 +147,8 @@ class OpenCLOps(Ops):
     def _decode_table(self, dtype: np.dtype) -> cl.Buffer | None:
         return None if dtype == np.float32 else self._session.constant(decode_table(dtype))
 
-    def _encode_tables(self, dtype: np.dtype) -> tuple[cl.Buffer | None, cl.Buffer | None]:
-        if dtype == np.float32:
-            return None, None
-        table = encode_table(dtype)
-        return self._session.constant(table.start), self._session.constant(table.threshold)
+    def _encode_table(self, dtype: np.dtype) -> cl.Buffer | None:
+        return None if dtype == np.float32 else self._session.constant(encode_table(dtype).entry)
 
 
 def _whole(dtype: np.dtype) -> str:

@@ -22,8 +22,8 @@ inline Span span_of(int j, int pixels, int cells) {
 
 #ifdef MASK
 /* light * mask and mask; what the mask leaves unspecified is not looked at. */
-#define PIXEL(i) specified(picture + 3 * (i), table, (float)mask[i] / MASK_WHOLE)
-inline float4 specified(__global const SAMPLE *pixel, __global const float *table, float weight) {
+#define PIXEL(i) specified(picture + 3 * (i), light_of, (float)mask[i] / MASK_WHOLE)
+inline float4 specified(__global const SAMPLE *pixel, __global const float *light_of, float weight) {
   if (!(weight > 0.0f)) return (float4)(0.0f);
   weight = weight > FAINTEST ? weight : FAINTEST;
   return weight * (float4)(LIGHT(pixel[0]), LIGHT(pixel[1]), LIGHT(pixel[2]), 1.0f);
@@ -33,7 +33,7 @@ inline float4 specified(__global const SAMPLE *pixel, __global const float *tabl
 #endif
 
 /* Item (k, y): row y of a band whose first row in the picture is `top`, summed over each of the cells k * run .. */
-__kernel void sum_rows(__global const SAMPLE *restrict picture, __global const float *restrict table,
+__kernel void sum_rows(__global const SAMPLE *restrict picture, __global const float *restrict light_of,
 #ifdef MASK
                        __global const MASK *restrict mask,
 #endif

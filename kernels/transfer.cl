@@ -20,33 +20,13 @@ inline float unit(float x) {
   return x < 1.0f ? x : 1.0f;
 }
 
-#if TOP
-/* x^(1/4) within 3e-7 of itself: a guess at x^(-1/4) by exponent arithmetic, then a minimax polynomial in its error. */
-inline float fourth_root(float x) {
-  float guess = as_float(0x4f581000 - (as_int(x) >> 2));
-  float root = x * guess * guess * guess, d = 1.0f - root * guess;
-  return root * (1.000000061f + d * (0.750000499f + d * (0.6561759444f
-               + d * (0.6013772391f + d * (0.5763343444f + d * 0.5538296185f)))));
-}
-
-/* The code of x. encode(x) is a minimax polynomial in the fourth root, within 6e-7 on 0..1: a code can differ from the
- * exactly rounded one only where x lies that near to the border between two. */
-inline SAMPLE code_of(float x) {
-  x = unit(x);
-  float t = fourth_root(x);
-  float power = -0.05844407142f + t * (0.1235540544f + t * (1.461571078f + t * (-1.155788569f
-              + t * (1.208537755f + t * (-0.897374294f + t * (0.3939299771f + t * -0.07598623589f))))));
-  return (SAMPLE)(int)(TOP * (x <= 0.0031308f ? 12.92f * x : power) + 0.5f);
-}
-#else
-#define code_of(x) srgb_of(x)
-#endif
-
-inline float relit(float x, float log_r) { return x + (x + EPSILON) * (exp2_of(log_r) - 1.0f); }
+/* x under R = (1 + q)^2: x + (x + e) (R - 1). */
+inline float relit(float x, float q) { return x + (x + EPSILON) * (q * (q + 2.0f)); }
 
 /* Relight the pixel at `from` into `to`: at `offset` from the middle of its cell along the row, with the vertical
  * weights `down`, amid the nodes `near` of its own and the eight cells around. A call would not be vectorised. */
-__attribute__((always_inline)) inline void relight(__global const SAMPLE *from, __global SAMPLE *to, __global const float *table,
+__attribute__((always_inline)) inline void relight(__global const SAMPLE *from, __global SAMPLE *to,
+                    __global const float *light_of, __global const int *code_of,
                     const float4 *near, const float *down, float offset) {
   float g = unit(0.25f / WHOLE * ((float)from[0] + 2.0f * (float)from[1] + (float)from[2])) * (1.0f / SIGMA);
   float across[3], total = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
@@ -61,18 +41,19 @@ __attribute__((always_inline)) inline void relight(__global const SAMPLE *from, 
     t += weight * near[k].z;
   }
   float scale = 1.0f / total;
-  SAMPLE red = code_of(relit(DECODE(from[0]), r * scale));
-  SAMPLE green = code_of(relit(DECODE(from[1]), s * scale));
-  SAMPLE blue = code_of(relit(DECODE(from[2]), t * scale));
+  SAMPLE red = ENCODE(relit(DECODE(from[0]), r * scale));
+  SAMPLE green = ENCODE(relit(DECODE(from[1]), s * scale));
+  SAMPLE blue = ENCODE(relit(DECODE(from[2]), t * scale));
   to[0] = red;
   to[1] = green;
   to[2] = blue;
 }
 
 /* Item (k, y): row y of a band whose first row in the photo is `top`, in the cells k * run .. of that row. nodes:
- * (rows + 2, columns + 2) of (log2 R, lightness / SIGMA), the border repeated. */
+ * (rows + 2, columns + 2) of (sqrt(R) - 1, lightness / SIGMA), the border repeated. */
 __kernel void transfer(__global const SAMPLE *restrict photo, __global const float4 *restrict nodes,
-                       __global const float *restrict table, __global SAMPLE *restrict result,
+                       __global const float *restrict light_of, __global const int *restrict code_of,
+                       __global SAMPLE *restrict result,
                        int height, int width, int rows, int columns, int top, int run) {
   int y = get_global_id(1), begin = get_global_id(0) * run, end = columns - begin < run ? columns : begin + run;
   long centre = (2 * (long)(top + y) + 1) * rows;
@@ -94,9 +75,9 @@ __kernel void transfer(__global const SAMPLE *restrict photo, __global const flo
       int at = x + lanes < count ? x : count - lanes;
       if (lanes == LANES) {
 #pragma clang loop vectorize_width(LANES) interleave_count(1)
-        for (int k = at; k < at + LANES; ++k) relight(from + 3 * k, to + 3 * k, table, near, down, offset + step * k);
+        for (int k = at; k < at + LANES; ++k) relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down, offset + step * k);
       } else {
-        for (int k = at; k < at + lanes; ++k) relight(from + 3 * k, to + 3 * k, table, near, down, offset + step * k);
+        for (int k = at; k < at + lanes; ++k) relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down, offset + step * k);
       }
     }
   }

@@ -2,17 +2,18 @@
 
     photo' = (photo + e) * R - e = photo + (photo + e) * (R - 1),     e = 0.02, linear light
 
-On the grid log2 R = log2((relit + e) / (source + e)). At a pixel it is the weighted mean of the 3 x 3 cells
-around the one it lies in (joint bilateral upsampling; Kopf, Cohen, Lischinski, Uyttendaele, 2007):
+On the grid R = (relit + e) / (source + e). At a pixel, sqrt(R) is the weighted mean of the 3 x 3 cells around
+the one it lies in (joint bilateral upsampling; Kopf, Cohen, Lischinski, Uyttendaele, 2007):
 
     w_k = B(dx) * B(dy) / (1 + (g - g_k)^2 / SIGMA^2)
 
 B is the quadratic B-spline, which is smooth across cells; g is the pixel's lightness and g_k the cell's. The
 reciprocal is taken within 12 % by exponent arithmetic, the same on every device: a weight only needs its
-shape.
+shape. The root lies between R, whose mean is drawn to the brightest cell, and log R, which is a little more
+accurate still and needs an exponential for every sample.
 
 A cell's value is a mean, so a smooth interpolation of the values would be flatter than the light was. Before
-it, log2 R is sharpened by what the spline will blur, and kept between the least and greatest of its 3 x 3
+it, sqrt(R) is sharpened by what the spline will blur, and kept between the least and greatest of its 3 x 3
 neighbours: no halo can come of it, and R never leaves the range of the grid's own quotients."""
 
 from __future__ import annotations
@@ -29,14 +30,15 @@ LIGHTNESS = np.array([0.25, 0.5, 0.25], np.float32)
 
 
 def nodes(source: FloatArray, relit: FloatArray) -> FloatArray:
-    """(h, w, 3) linear grids -> (h + 2, w + 2, 4) float32: log2 R, g / SIGMA by cell, the border repeated.
+    """(h, w, 3) linear grids -> (h + 2, w + 2, 4) float32: sqrt(R) - 1, g / SIGMA by cell, the border
+    repeated. Where the grids are equal the first is exactly 0.
 
-    log2 R is kept within -126..126, so that R is a normal float32.
+    R is kept below 2^126, so that it is a normal float32.
     """
     quotient = (relit.astype(np.float64) + EPSILON) / (source.astype(np.float64) + EPSILON)
-    log_r = _sharpen(np.clip(np.log2(quotient), -126, 126))
+    q = _sharpen(np.sqrt(np.minimum(quotient, 2.0**126)) - 1)
     lightness = np.clip(linear_to_srgb(source) @ LIGHTNESS, 0, 1) / SIGMA
-    cells = np.concatenate([log_r, lightness[..., None]], 2)
+    cells = np.concatenate([q, lightness[..., None]], 2)
     return np.pad(cells, ((1, 1), (1, 1), (0, 0)), mode="edge").astype(np.float32)
 
 
