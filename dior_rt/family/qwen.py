@@ -258,9 +258,16 @@ class Qwen:
 
 def rescaled(v: Array, like: Array) -> Array:
     """v with each token's norm made that of `like`; a token of norm 0 stays 0."""
-    norm = np.linalg.norm(v, axis=-1, keepdims=True)
-    wanted = np.linalg.norm(like, axis=-1, keepdims=True)
-    return v * np.divide(wanted, norm, out=np.zeros_like(norm), where=norm > 0)
+    (v, _, norm), (_, largest, wanted) = _measured(v), _measured(like)
+    return v / np.maximum(norm, 1) * (largest * wanted)
+
+
+def _measured(v: Array) -> tuple[Array, Array, Array]:
+    """Each token by its largest |value|, that value, and the norm of what is left: 0, or at least 1. So no
+    square overflows, and none vanishes."""
+    largest = np.abs(v).max(axis=-1, keepdims=True)
+    unit = np.divide(v, largest, out=np.zeros_like(v), where=largest > 0)
+    return unit, largest, np.linalg.norm(unit, axis=-1, keepdims=True)
 
 
 def pack(latents: Array, patch: int) -> Array:
