@@ -21,7 +21,7 @@ from dior_rt.family.qwen import Qwen
 from dior_rt.family.qwen_frame import shrink
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
-from dior_rt.presets import ALWAYS, Sampling, sampling
+from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
 from dior_rt.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.schedule import ShiftSchedule
 from dior_rt.stopwatch import Stopwatch
@@ -95,6 +95,11 @@ class Relighter:
         self.device, self.device_reason = self._family.device, self._family.reason
         self.ops, self.ops_reason = self._ops.name, self._ops.reason
 
+    @property
+    def presets(self) -> tuple[str, ...]:
+        """The names that `relight` takes as its preset. Raises BundleError."""
+        return REFERENCE, *read_presets(self.bundle)
+
     @_device_errors()
     def relight(
         self,
@@ -118,7 +123,7 @@ class Relighter:
         strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
         sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
         Stroke, in pixels of the photo.
-        preset: "reference", or a faster one of the model's own, "balanced" or "fast"; see `Relighter.presets`.
+        preset: "reference" or a faster one of the model's own, such as "fast"; see `Relighter.presets`.
         steps, solver, shift, guidance, interval, tolerance: each goes over the preset's where it is not None;
         see `Sampling`. intensity: multiplies the light, >= 0.
         progress: called after each step with (step, steps), of which it passes several at a time where the
@@ -218,7 +223,9 @@ class Relighter:
         """The state at the end of the flow, and how many steps led there."""
         noise = draw_noise(seed, self._family.noise_shape(condition))
         noise *= np.float32(self.bundle.manifest.noise_scale)
-        for taken, state in enumerate(self._states(condition, how, noise), start=1):
+        taken = 0
+        for state in self._states(condition, how, noise):
+            taken += 1
             if progress and progress(state.step, state.steps) is False:
                 raise Cancelled(f"Stopped after step {state.step} of {state.steps}.")
         return state.x, taken

@@ -1,4 +1,4 @@
-"""The sampler: from noise to image along the flow, one Euler step a time.
+"""The sampler: from noise to image along the flow, by one of the solvers.
 
 sigma is flow time, 1 = noise and 0 = image: x = (1 - sigma) x0 + sigma eps, and the velocity is
 v = dx/dsigma = eps - x0. The state is float32 whatever the network computes in. `sample` is a generator:
@@ -14,9 +14,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+from dior_rt.solvers import MEMORY, SOLVERS, Array, Past, Velocity
+
 Condition = Mapping[str, NDArray]  # what the network sees besides x and sigma; its arrays lead with the batch
-Velocity = Callable[[Array, float], Array]  # (x, sigma) -> v, of x's shape
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,33 @@ def guided(
     return velocity
 
 
-def euler(x: Array, v: Array, sigma: float, sigma_next: float) -> Array:
-    """One step of Euler's method, in float32."""
-    return x + np.float32(sigma_next - sigma) * v.astype(np.float32, copy=False)
+def between(low: float, high: float, inside: Velocity, outside: Velocity) -> Velocity:
+    """`inside` where low <= sigma <= high, else `outside`.
+
+    Guidance in an interval (arXiv 2404.07724) is the guided velocity inside and the condition's outside.
+    """
+
+    def velocity(x: Array, sigma: float) -> Array:
+        return inside(x, sigma) if low <= sigma <= high else outside(x, sigma)
+
+    return velocity
 
 
-def sample(velocity: Velocity, noise: Array, sigmas: Array) -> Iterator[State]:
-    """Walk x from `noise` at sigmas[0] to sigmas[-1], yielding the state after every step."""
-    x, steps = noise.astype(np.float32, copy=False), len(sigmas) - 1
-    for step, (sigma, sigma_next) in enumerate(pairwise(sigmas.tolist()), start=1):
-        v = velocity(x, sigma)
-        x, x0 = euler(x, v, sigma, sigma_next), euler(x, v, sigma, 0.0)
-        yield State(step, steps, sigma_next, x, x0)
+def sample(velocity: Velocity, noise: Array, sigmas: Array, solver: str = "euler") -> Iterator[State]:
+    """Walk x from `noise` at sigmas[0] to sigmas[-1], yielding the state after every step.
+
+    solver: a name of `SOLVERS`; KeyError for another.
+    """
+    method, steps = SOLVERS[solver], len(sigmas) - 1
+    velocity = in_float32(velocity)
+    x = noise.astype(np.float32, copy=False)
+    past: Past = ()
+    for step, (sigma, then) in enumerate(pairwise(sigmas.tolist()), start=1):
+        x, start = method.step(velocity, x, sigma, then, past)
+        past = (start, *past)[:MEMORY]
+        yield State(step, steps, then, x, start.x0)
+
+
+def in_float32(velocity: Velocity) -> Velocity:
+    """The velocity of a network that may compute in something else."""
+    return lambda x, sigma: velocity(x, sigma).astype(np.float32, copy=False)

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+
+def _share(text: str) -> float:
+    """A number, or a fraction such as 0.5/255."""
+    above, bar, below = text.partition("/")
+    try:
+        return float(Fraction(above) / Fraction(below if bar else 1))
+    except (ValueError, ZeroDivisionError, OverflowError):
+        raise typer.BadParameter(f"{text!r} is no number and no fraction such as 0.5/255.") from None
 
 
 def _finite(value: float | None) -> float | None:
@@ -28,6 +38,33 @@ Ops = Annotated[
 Steps = Annotated[
     int | None,
     typer.Option(min=1, max=1000, help="Steps of the sampler [default: the model's own]."),
+]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="reference, balanced or fast; what else is given goes over it [default: reference].",
+    ),
+]
+Solver = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="euler, heun, adams, dpmpp-2m or unipc [default: the preset's]."),
+]
+Shift = Annotated[
+    float | None,
+    typer.Option(callback=_finite, help="Above 1, more of the steps are near noise [default: the model's]."),
+]
+Interval = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LOW HIGH", help="Guidance acts only between these sigmas [default: 0 1]."),
+]
+Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        parser=_share,
+        metavar="ERROR",
+        help="Take as many steps as keep the picture's error below this, such as 0.5/255.",
+    ),
 ]
 Guidance = Annotated[
     float | None,

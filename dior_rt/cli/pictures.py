@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -40,8 +41,13 @@ def relight(
     bundle: options.Bundle = None,
     device: options.Device = "auto",
     ops: options.Ops = "auto",
+    preset: options.Preset = None,
     steps: options.Steps = None,
+    solver: options.Solver = None,
+    shift: options.Shift = None,
     guidance: options.Guidance = None,
+    interval: options.Interval = None,
+    tolerance: options.Tolerance = None,
     seed: options.Seed = 0,
     intensity: options.Intensity = 1.0,
     key: Annotated[
@@ -63,6 +69,9 @@ def relight(
       dior-rt relight photo.jpg warm.json --intensity 3 -o warm.tif
     A picture whose black means "not drawn":
       dior-rt relight photo.jpg light.jpg --key black
+    Fast, or within half a level of 255 of what all the steps would give:
+      dior-rt relight photo.jpg strokes.png --preset fast
+      dior-rt relight photo.jpg strokes.png --tolerance 0.5/255
     """
     watch = Watch()
     import numpy as np
@@ -83,16 +92,21 @@ def relight(
         relit = relighter.relight(
             picture.pixels,
             drawing,
+            preset=preset,
             steps=steps,
+            solver=solver,
+            shift=shift,
             guidance=guidance,
+            interval=interval,
+            tolerance=tolerance,
             seed=seed,
             intensity=intensity,
             progress=watch.first_step(advance),
         )
     watch.lap("relight")
     settings = _settings(relighter) | {
+        **asdict(relit.sampling),
         "steps": relit.steps,
-        "guidance": relit.guidance,
         "seed": relit.seed,
         "intensity": relit.intensity,
     }

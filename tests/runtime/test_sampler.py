@@ -1,11 +1,11 @@
-"""The sampler on velocity fields whose flow is known, and against diffusers' scheduler."""
+"""The sampler on velocity fields whose flow is known, and the schedules against diffusers'."""
 
 import math
 
 import numpy as np
 import pytest
 
-from dior_rt.sampler import draw_noise, euler, guide, guided, sample
+from dior_rt.sampler import between, draw_noise, guide, guided, sample
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 EVEN = ShiftSchedule(1.0)
@@ -46,18 +46,6 @@ def test_every_state_lies_on_the_gaussian_path():
         s = state.sigma
         path = (1 - s) * mean + math.hypot((1 - s) * deviation, s) * noise
         np.testing.assert_allclose(state.x, path, atol=4e-3)
-
-
-def test_euler_converges_with_order_one():
-    noise = draw_noise(5, (64,))
-    exact = gaussian_end(noise, 0.4, 0.3)
-    steps = np.array([10, 20, 40, 80, 160])
-    errors = [
-        np.abs(last(sample(gaussian_velocity(0.4, 0.3), noise, EVEN.sigmas(n))).x - exact).max()
-        for n in steps
-    ]
-    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert -1.1 < slope < -0.9
 
 
 @pytest.mark.parametrize("steps", [1, 2, 40, 1000])
@@ -185,7 +173,12 @@ def test_guidance_runs_both_branches_in_one_batch_and_one_where_one_is_enough(sc
     assert network.batches == [batch]
 
 
-def test_euler_goes_nowhere_in_no_time():
-    x, v = draw_noise(1, (4,)), draw_noise(2, (4,))
-    np.testing.assert_array_equal(euler(x, v, 0.5, 0.5), x)
-    np.testing.assert_allclose(euler(x, v, 1.0, 0.25), x - 0.75 * v, atol=1e-6)
+@pytest.mark.parametrize(
+    ("sigma", "level"), [(1.0, 0.0), (0.81, 0.0), (0.8, 9.0), (0.5, 9.0), (0.3, 9.0), (0.29, 0.0)]
+)
+def test_guidance_in_an_interval_is_the_condition_alone_outside_of_it(sigma, level):
+    def constant(value):
+        return lambda x, sigma: np.full_like(x, value)
+
+    v = between(0.3, 0.8, constant(9), constant(0))(draw_noise(0, (4,)), sigma)
+    np.testing.assert_array_equal(v, np.full(4, level, np.float32))
