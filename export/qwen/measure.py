@@ -1,6 +1,7 @@
 """One block of the released model's width, measured; and what follows from it for the whole model.
 
     python -m dior_rt.export.qwen.measure --side 512 --runs 3 --threads 2
+    python -m dior_rt.export.qwen.measure --precisions          (nothing is run: on paper only)
 
 Writes a block with random weights in each precision, runs it in ONNX Runtime and in torch on the same inputs,
 in turn, and prints seconds, error and size. The projection multiplies: blocks x branches x steps for time,
@@ -46,13 +47,27 @@ STEPS: Final = 40
 BRANCHES: Final = 2
 USED: Final = 0.4  # of a GPU's peak, which large matrices reach in practice
 
-# Memory in GB, dense fp16 TFLOP/s with fp32 accumulation; from the makers' data sheets.
-GPUS: Final = {
-    "NVIDIA RTX 4090": (24, 165.0),
-    "NVIDIA A100 80 GB": (80, 312.0),
-    "NVIDIA H100 SXM": (80, 989.0),
-    "AMD MI300X": (192, 1307.0),
-}
+FEW_STEPS: Final = 8  # of a few-step LoRA, which takes no guidance
+LIVE: Final = (
+    12  # streams that a block holds at most: MLP before and after its GELU 4 each, in fp16 2, x, LayerNorm
+)
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """From the maker's data sheet: memory in GB, dense fp16 TFLOP/s with fp32 accumulation."""
+
+    name: str
+    memory: int
+    tflops: float
+
+
+GPUS: Final = (
+    Gpu("NVIDIA RTX 4090", 24, 165.0),
+    Gpu("NVIDIA A100 80 GB", 80, 312.0),
+    Gpu("NVIDIA H100 SXM", 80, 989.0),
+    Gpu("AMD MI300X", 192, 1307.0),
+)
 
 
 class RandomWeights:
@@ -136,25 +151,44 @@ def flops(config: TransformerConfig, image: int, text: int) -> float:
     return float(projections + attention)
 
 
-def report(measured: Sequence[Measured], tokens: int) -> str:
-    """The figures as text, with what they mean for the whole model."""
-    operations, weights = flops(RELEASED, tokens, WORDS), RandomWeights(RELEASED, 0).count
+def report(measured: Sequence[Measured], side: int) -> str:
+    """The figures as text, with what they mean for the whole model here and, on paper, elsewhere."""
+    tokens, weights = reference_tokens(side), RandomWeights(RELEASED, 0).count
+    operations = flops(RELEASED, tokens, WORDS)
     lines = [
         f"one block: {weights / 1e6:.0f} M weights, {tokens} + {WORDS} tokens, {operations / 1e12:.2f} TFLOP",
-        "precision  seconds  in torch  error    weights  | 60 blocks, 40 steps, guidance",
+        f"precision  seconds  in torch  error    weights  | 60 blocks  {STEPS} steps guided  {FEW_STEPS} not",
     ]
     for m in measured:
         size, whole = m.bytes / 1e9, RELEASED.num_layers * m.bytes / 1e9
-        hours = RELEASED.num_layers * STEPS * BRANCHES * m.seconds / 3600
+        step = RELEASED.num_layers * m.seconds / 3600
         lines.append(
             f"{m.precision:9}  {m.seconds:7.2f}  {m.torch_seconds:8.2f}  {m.error:.1e}  {size:4.2f} GB"
-            f"  | {whole:5.1f} GB  {hours:6.1f} h"
+            f"  | {whole:5.1f} GB  {step * STEPS * BRANCHES:13.1f} h  {step * FEW_STEPS:5.1f} h"
         )
-    total = operations * RELEASED.num_layers * STEPS * BRANCHES
-    for name, (memory, tflops) in GPUS.items():
-        seconds = total / (tflops * 1e12 * USED)
-        lines.append(f"on paper: {name}, {memory} GB: {seconds:.0f} s in fp16 at {USED:.0%} of its peak")
-    return "\n".join(lines)
+    return "\n".join([*lines, *on_paper(512), *on_paper(1024)])
+
+
+def on_paper(side: int) -> list[str]:
+    """Seconds that pictures of side x side take in fp16, and whether a GPU's memory holds the blocks."""
+    tokens = reference_tokens(side)
+    total = flops(RELEASED, tokens, WORDS) * RELEASED.num_layers * STEPS * BRANCHES
+    modulation = 12 * RELEASED.width * (RELEASED.width + 1)  # a table, not weights that stay
+    blocks = 2e-9 * RELEASED.num_layers * (RandomWeights(RELEASED, 0).count - modulation)
+    states = 4e-9 * LIVE * (tokens + WORDS) * RELEASED.width
+    lines = [f"on paper, {side} x {side}, fp16: blocks {blocks:.1f} GB, states {states:.1f} GB"]
+    for gpu in GPUS:
+        seconds = total / (gpu.tflops * 1e12 * USED)
+        short = blocks + states - gpu.memory
+        held = f"{short:.1f} GB of the blocks are read anew at each step" if short > 0 else "all in memory"
+        lines.append(f"  {gpu.name}, {gpu.memory} GB: {seconds:.0f} s at {USED:.0%} of its peak, {held}")
+    return lines
+
+
+def reference_tokens(side: int) -> int:
+    """Tokens of a square picture that is painted, and of its two references."""
+    rows, columns = fit_area(side**2, 1, 1, 32)
+    return 3 * (rows // 16) * (columns // 16)
 
 
 def main() -> None:
@@ -164,14 +198,15 @@ def main() -> None:
     )
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--threads", type=int)
-    parser.add_argument("--precisions", nargs="+", choices=PRECISIONS, default=["fp32", "int8", "int4"])
+    parser.add_argument("--precisions", nargs="*", choices=PRECISIONS, default=["fp32", "int8", "int4"])
     parser.add_argument("--json", type=Path, help="also write the figures there")
     options = parser.parse_args()
     if options.threads:
         torch.set_num_threads(options.threads)
     rows, columns = (side // 16 for side in fit_area(options.side**2, 1, 1, 32))
-    measured = measure(RELEASED, [(rows, columns)] * 3, options.runs, options.threads, options.precisions)
-    print(report(measured, 3 * rows * columns))
+    asked = RELEASED, [(rows, columns)] * 3, options.runs, options.threads, options.precisions
+    measured = measure(*asked) if options.precisions else []
+    print(report(measured, options.side))
     if options.json:
         text = json.dumps([asdict(one) for one in measured], indent=2)
         options.json.write_text(text + "\n", encoding="utf-8")
