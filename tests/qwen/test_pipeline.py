@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny_qwen
 import torch
+from agreement_qwen import RECIPE
 from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit_plus as edit_plus
+from loras_qwen import LAYERS, write_lora
 from PIL import Image
 
 from dior_rt.bundle import read_bundle
 from dior_rt.errors import InputError
+from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.errors import probe_strokes, psnr, relative
+from dior_rt.export.qwen.lora import Lora
 from dior_rt.family.qwen import Qwen, pack, rescaled, unpack
 from dior_rt.kernels import Strokes
 from dior_rt.sampler import draw_noise, sample
@@ -77,6 +83,31 @@ def test_without_guidance_one_branch_is_what_diffusers_paints(qwens, pipes, monk
     noise = draw_noise(0, qwen.noise_shape(condition))
     want = run_diffusers(pipes[True], pictures, (96, 96), 8, 1.0, noise, monkeypatch)
     assert psnr(qwen.decode_relit(run(qwen, condition, 8, 1.0), condition), want) >= 50
+
+
+@pytest.mark.parametrize("steps", [4, 8])
+def test_a_few_step_lora_beside_another_paints_what_diffusers_paints(folders, tmp_path, monkeypatch, steps):
+    # As Lightning is published: bare keys with alpha, and the scheduler's settings that go with it.
+    light = write_lora(tmp_path / "light.safetensors", "diffusers", rank=4)
+    fast = write_lora(tmp_path / "fast.safetensors", "bare", rank=2, alpha=1, seed=5, layers=LAYERS[2:6])
+    shift = {"base_shift": np.log(3), "max_shift": np.log(3), "shift_terminal": None}
+    pipe = tiny_qwen.pipeline(scheduler={**tiny_qwen.SCHEDULER, **shift})
+    pipe.load_lora_weights(str(light), adapter_name="light")
+    pipe.load_lora_weights(str(fast), adapter_name="fast")
+    pipe.set_adapters(["light", "fast"], [1.25, 0.8])
+    recipe = replace(RECIPE, free_steps=False).few_steps(steps)
+    loras = [Lora(light, 1.25), Lora(fast, 0.8)]
+    qwen = Qwen(export_qwen(folders[True], tmp_path / "bundle", recipe, loras=loras), "cpu")
+
+    photo, strokes = photo_of(96, 96), probe_strokes((96, 96))
+    condition = qwen.encode(photo, strokes, "relight")
+    pictures = [np.rint(photo * 255).astype(np.uint8), qwen.draw(strokes)]
+    noise = draw_noise(0, qwen.noise_shape(condition))
+    want = run_diffusers(pipe, pictures, (96, 96), steps, 1.0, noise, monkeypatch)
+    assert psnr(qwen.decode_relit(run(qwen, condition, steps, 1.0), condition), want) >= 50
+    pipe.set_adapters(["light"], [1.25])
+    without = run_diffusers(pipe, pictures, (96, 96), steps, 1.0, noise, monkeypatch)
+    assert psnr(without, want) < 40
 
 
 def test_guidance_of_zero_and_one_are_the_two_branches(qwens):

@@ -6,17 +6,23 @@ import numpy as np
 import pytest
 import tiny_qwen
 import torch
+from accelerate.state import AcceleratorState
 from agreement_qwen import AREA, RECIPE, call_both
+from PIL import Image
+from safetensors.torch import load_file
 
+from dior_rt.cli import run
 from dior_rt.errors import InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.family.mini import MODES
 from dior_rt.family.qwen import Qwen
-from dior_rt.kernels import Strokes
+from dior_rt.family.qwen_config import LUMI_PEAK
+from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.training import qwen as training
 from dior_rt.training.fit import Plan, flow_loss
 from dior_rt.training.render import View
+from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_own_strokes
 from dior_rt.training.triplets import Batches, load_views
 
 SAID = {MODES["relight"]: "light it from the left", MODES["estimate"]: "draw its light"}
@@ -164,6 +170,139 @@ def test_training_and_runtime_ask_the_same_network(qwens, prompts):
 def test_tokens_are_unpacked_to_what_was_packed():
     latents = torch.randn(4, 6, 10)
     assert torch.equal(training.unpack(training.pack(latents), 3, 5), latents)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory):
+    """A scene of three photos: one surface under one light after another."""
+    folder, random = tmp_path_factory.mktemp("pairs"), np.random.default_rng(1)
+    surface = smooth(random, 72)
+    (folder / "room").mkdir()
+    for k in range(3):
+        photo = NumpyOps().encode_srgb(surface * smooth(random, 72), np.uint8)
+        Image.fromarray(photo).save(folder / "room" / f"{k}.png")
+    return folder
+
+
+def test_stage_two_lowers_the_loss_on_real_pairs_it_has_not_drawn(
+    folders, renders, pairs, trained, prompts, tmp_path
+):
+    # From the LoRA of stage 1, under strokes of the model's own, by the code that trains mini.
+    file, scenes = trained / "pytorch_lora_weights.safetensors", load_scenes(pairs)
+    plan = Plan(steps=10, batch=4, rate=2e-3, warmup=1, average=1, save_every=100)
+
+    def backbone(start):
+        return training.QwenLora(folders[True], tmp_path / "lora", 4, prompts, 64 * 64, start)
+
+    losses = []
+    fit_stage2(
+        lambda: backbone(file),
+        renders,
+        scenes,
+        tmp_path / "lora",
+        plan,
+        Mixture(rendered_weight=0.5, estimate_steps=2),
+        lambda step, loss: losses.append(loss),
+    )
+    assert len(losses) == 10 and np.isfinite(losses).all()
+    unseen = MixedBatches(scenes, Batches(load_views(renders), 2, seed=9), (77,), 0, 0.5)
+    before = backbone(file)
+    asked = with_own_strokes(before, next(iter(unseen)), 2, plan.shift)
+    given = before.prepare(asked)
+    noise = torch.randn(given["x0"].shape, generator=torch.Generator().manual_seed(0))
+
+    def loss(network):
+        with torch.no_grad():
+            return float(flow_loss(network, given, torch.tensor([1.0, 0.9, 1.0, 0.8]), noise))
+
+    after = backbone(tmp_path / "lora" / "pytorch_lora_weights.safetensors")
+    assert loss(after.network) < 0.99 * loss(before.network)
+
+
+def test_light_that_was_drawn_is_read_back():
+    light = torch.rand(2, 3, 4, 4) * LUMI_PEAK
+    torch.testing.assert_close(training.undraw(training.draw(light)), light, rtol=1e-4, atol=1e-5)
+
+
+def test_latents_are_decoded_to_what_diffusers_paints():
+    vae = tiny_qwen.vae()
+    pictures = training.Pictures(vae, 64 * 64)
+    latents = pictures.encode(torch.rand(2, 3, 64, 64))
+    raw = latents * pictures.std + pictures.mean
+    with torch.no_grad():
+        want = (vae.decode(raw[:, :, None]).sample[:, :, 0] + 1) / 2
+    torch.testing.assert_close(pictures.decode(latents), want.clamp(0, 1), rtol=1e-4, atol=1e-5)
+
+
+def test_training_goes_on_from_a_lora_of_its_own_and_from_no_other(folders, trained, prompts, tmp_path):
+    file = trained / "pytorch_lora_weights.safetensors"
+    made = training.QwenLora(folders[True], tmp_path / "out", 4, prompts, start=file)
+    made.save(made.network)
+    again, first = (load_file(folder / file.name) for folder in (tmp_path / "out", trained))
+    assert again.keys() == first.keys()
+    assert all(torch.equal(again[name], first[name]) for name in first)
+    with pytest.raises(InputError, match="it is of other layers, or of another rank"):
+        training.QwenLora(folders[True], tmp_path / "other", 3, prompts, start=file)
+    with pytest.raises(InputError, match="Cannot go on from the LoRA"):
+        training.QwenLora(folders[True], tmp_path / "other", 4, prompts, start=tmp_path / "none")
+
+
+@pytest.fixture
+def another_precision():
+    """accelerate holds a process to its first precision; it forgets it here as in its own tests."""
+    AcceleratorState._reset_state(reset_partial_state=True)
+    yield
+    AcceleratorState._reset_state(reset_partial_state=True)
+
+
+@pytest.mark.usefixtures("another_precision")
+def test_half_the_memory_trains_a_lora_in_single_precision(folders, renders, prompts, tmp_path):
+    plan = Plan(steps=2, batch=2, rate=2e-3, warmup=1, save_every=100, precision="bf16")
+    losses = []
+    training.fit_qwen_lora(
+        folders[True], renders, tmp_path, 2, plan, prompts, 64 * 64, lambda step, loss: losses.append(loss)
+    )
+    assert np.isfinite(losses).all()
+    weights = load_file(tmp_path / "pytorch_lora_weights.safetensors")
+    assert {weight.dtype for weight in weights.values()} == {torch.float32}
+    beneath = training.QwenLora(folders[True], tmp_path, 2, prompts, dtype=torch.bfloat16).network
+    kept = {weight.dtype for name, weight in beneath.named_parameters() if "transformer_blocks" in name}
+    assert kept == {torch.bfloat16, torch.float32}
+
+
+def test_the_commands_train_resume_and_export(folders, renders, pairs, tmp_path, capfd):
+    model, first, second = str(folders[True]), tmp_path / "first", tmp_path / "second"
+    small = ["--side", "64", "--rank", "2", "--batch", "2"]
+    assert run(["train", "qwen-lora", model, str(renders), "--out", str(first), "--steps", "1", *small]) == 0
+    capfd.readouterr()
+    assert run(["train", "qwen-lora", model, str(renders), "--out", str(first), "--steps", "2", *small]) == 0
+    assert "step 2/2" in capfd.readouterr().err
+    start = ["--start", str(first / "pytorch_lora_weights.safetensors")]
+    asked = [model, str(renders), str(pairs), "--out", str(second), "--steps", "1", *small, *start]
+    assert run(["train", "stage2", *asked]) == 0
+    lora = str(second / "pytorch_lora_weights.safetensors")
+    merged = ["--lora", lora, "--prompt-cache", "--few-steps", "2", "--weights", "fp32"]
+    assert run(["export", model, "-o", str(tmp_path / "bundle"), *merged]) == 0
+    assert (tmp_path / "bundle" / "manifest.json").is_file()
+
+
+def test_commands_say_in_one_sentence_what_they_cannot_use(folders, renders, pairs, tmp_path, capfd):
+    model, out, none = str(folders[True]), tmp_path / "out", str(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    for arguments, saying in (
+        (["qwen-lora", model, none], "There are no renders in"),
+        (["qwen-lora", none, str(renders)], "Cannot read the text encoder in"),
+        (["stage2", model, str(renders), none], "Cannot read the folder of pairs"),
+        (["stage2", model, str(renders), str(tmp_path / "empty")], "There are no scenes in"),
+        (["stage2", model, str(renders), str(pairs), "--batch", "3"], "must be even"),
+        (["stage2", model, str(renders), str(pairs), "--photos", "*.exr"], "a pair takes two"),
+        (["stage2", none, str(renders), str(pairs), "--start", "x"], "is no Qwen-Image-Edit"),
+        (["stage2", none, str(renders), str(pairs)], "Cannot read the checkpoint"),
+    ):
+        assert run(["train", *arguments, "--out", str(out)]) == 2
+        said = capfd.readouterr().err
+        assert said.count("\n") == 1 and said.startswith("dior-rt: ") and saying in said, said
+        assert not out.exists()
 
 
 def test_a_folder_that_is_no_model_is_refused(renders, prompts, tmp_path):
