@@ -2,7 +2,7 @@
 
 A step is a pure function of the state, of the two sigmas, and of the points where the velocity was asked
 before. Every method is Euler's step with a better velocity, or, which is the same, towards a better image
-D: x + (sigma' - sigma) (x - D) / sigma. `SOLVERS` names them all; their orders are those on smooth fields.
+D: x + (sigma' - sigma) (x - D) / sigma. `SOLVERS` names them all.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ MEMORY: Final = 2  # points that a step looks back at
 @dataclass(frozen=True)
 class Solver:
     """step: (velocity, x, sigma, sigma', past) -> (x at sigma', the point it started from). asks: how often
-    it asks the velocity in a step; the step that reaches sigma' = 0 may ask less. order: of convergence."""
+    it asks the velocity in a step; the step that reaches sigma' = 0 may ask less. order: of convergence, at
+    least."""
 
     step: Step
     order: int
