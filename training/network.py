@@ -33,6 +33,7 @@ FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
 RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
 BOUNCED = 0.05  # b: light that reaches a place where no source shines, so that drawn darkness is no black hole
+BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
 SMALLEST_SIGMA = 1e-3
 
 
@@ -164,7 +165,7 @@ class Mini(nn.Module):
         photo, linear, white, aim, mask = given.split((3, 3, 3, 3, 1), dim=1)
         own = white + own  # the photo's own light, encoded; of white paper it is the photo itself
         # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
-        ratio = raw + mask * (aim - torch.log(decode_light(own) + BOUNCED))
+        ratio = raw + mask * (aim - torch.log(decode_light(own.clamp(max=BRIGHTEST)) + BOUNCED))
         relit = _relight(photo, linear, ratio)
         x0 = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
         return (x - x0) / sigma.clamp_min(SMALLEST_SIGMA)[:, None, None, None]
@@ -230,8 +231,11 @@ def _unit(part: Tensor) -> Tensor:
 
 
 def waves(sigma: Tensor, width: int) -> Tensor:
-    """(B,) flow times to (B, width) sinusoids, from one turn over 0..1 to a thousand."""
-    frequency = torch.exp(torch.linspace(0.0, math.log(1000.0), width // 2, device=sigma.device))
+    """(B,) flow times to (B, width) sinusoids of 1 to 10 rad over 0..1.
+
+    Finer waves would let the velocity change with sigma faster than a solver's steps can follow.
+    """
+    frequency = torch.exp(torch.linspace(0.0, math.log(10.0), width // 2, device=sigma.device))
     angle = sigma[:, None] * frequency
     return torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)
 
