@@ -11,6 +11,8 @@ from dior_rt.kernels import Strokes
 
 Picture = Image.Image | NDArray
 
+BRIGHTEST = 1e6  # of a float photo's samples: the sum of a whole photo's light stays a float32
+
 SHAPE_TOLERANCE = (
     0.01  # of a side; resizing by any whole number of pixels stays within it, or within one pixel
 )
@@ -23,8 +25,8 @@ def read_pixels(photo: Picture) -> NDArray:
         return np.asarray(photo.convert("RGB"))
     pixels = np.asarray(photo)
     _check_array("a photo", pixels, channels=3)
-    if pixels.dtype == np.float32 and not (np.isfinite(pixels).all() and pixels.min() >= 0):
-        raise InputError("A float photo must be finite and >= 0.")
+    if pixels.dtype == np.float32 and not (pixels.min() >= 0 and pixels.max() <= BRIGHTEST):
+        raise InputError(f"A float photo must be finite and >= 0, and at most {BRIGHTEST:g} times white.")
     return pixels
 
 

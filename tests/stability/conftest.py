@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("onnx")
@@ -16,8 +18,8 @@ import ledger
 import precisions
 import twin
 
-from dior_rt.bundle import default_bundle, read_bundle, write_bundle
-from dior_rt.engine import open_engine
+from dior_rt import Relighter
+from dior_rt.bundle import Bundle, default_bundle, read_bundle, write_bundle
 from dior_rt.family.mini import Mini
 from dior_rt.grid import GridRule
 from dior_rt.kernels import KernelError, NumpyOps, OpenCLOps, list_devices
@@ -58,34 +60,43 @@ def ops(request: pytest.FixtureRequest):
 
 
 @pytest.fixture(scope="session")
-def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The shipped model on a grid of some 16 x 16 cells, by precision."""
-    folder = tmp_path_factory.mktemp("precisions")
-    shipped = read_bundle(default_bundle())
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Bundle]:
+    """`bundle(precision)`: the shipped model on a grid of some 256 cells."""
+    folder, shipped = tmp_path_factory.mktemp("precisions"), read_bundle(default_bundle())
     grid = dataclasses.replace(GridRule(cells=256), multiple=shipped.manifest.grid.multiple)
-    found = {}
-    for precision in precisions.PRECISIONS:
+
+    @cache
+    def lowered(precision: str) -> Bundle:
         graph = precisions.lower(shipped.path("velocity"), precision, folder / f"{precision}.onnx")
         tensors = dataclasses.replace(shipped.manifest.graphs["velocity"], file="model.onnx", probe=None)
-        manifest = dataclasses.replace(
-            shipped.manifest, grid=grid, precision=precision, graphs={"velocity": tensors}, noise_scale=1.0
-        )
-        write_bundle(folder / precision, manifest, {"model.onnx": graph})
-        found[precision] = folder / precision
-    return found
+        changes = {"grid": grid, "precision": precision, "graphs": {"velocity": tensors}, "noise_scale": 1.0}
+        manifest = dataclasses.replace(shipped.manifest, **changes)
+        return write_bundle(folder / precision, manifest, {"model.onnx": graph})
+
+    return lowered
 
 
 @pytest.fixture(scope="session")
-def network(bundles) -> twin.Network:
+def relighter(bundle) -> Callable[[str, str], Relighter]:
+    """`relighter(precision, ops)`, loaded once; the network runs on one thread of the CPU."""
+    return cache(lambda precision, ops: Relighter(bundle(precision).folder, "cpu", ops, threads=1))
+
+
+@pytest.fixture(scope="session")
+def family(bundle) -> Mini:
+    return Mini(bundle("fp32"), "cpu", 1)
+
+
+@pytest.fixture(scope="session")
+def network(bundle) -> twin.Network:
     """The shipped model in float64."""
-    return twin.Network(read_bundle(bundles["fp32"]).path("velocity"))
+    return twin.Network(bundle("fp32").path("velocity"))
 
 
 @pytest.fixture(scope="session")
-def engines(bundles):
-    return {p: open_engine(read_bundle(folder), "velocity", "cpu", 1) for p, folder in bundles.items()}
-
-
-@pytest.fixture(scope="session")
-def family(bundles) -> Mini:
-    return Mini(read_bundle(bundles["fp32"]), "cpu", 1)
+def usual_feeds() -> dict[str, np.ndarray]:
+    """Inputs of the shipped graph, of both modes and several sigmas: the bundle's own self-test."""
+    shipped = read_bundle(default_bundle())
+    graph = shipped.manifest.graphs["velocity"]
+    with np.load(shipped.folder / graph.probe) as probe:
+        return {tensor.name: probe[tensor.name] for tensor in graph.inputs}

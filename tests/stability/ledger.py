@@ -26,13 +26,15 @@ COMMAND = 'pytest tests/stability -m "slow or not slow" --numerics docs/numerics
 
 @dataclass(frozen=True)
 class Entry:
-    """The worst error of a case in one setting. where: the device, or the precision of the network."""
+    """The worst error of a case in one setting. where: the device, the network's precision, or the solver.
+    shown: what is printed of it."""
 
     case: str
     where: str
     unit: str
     bound: float
     seen: float
+    shown: str
 
 
 @dataclass
@@ -50,25 +52,26 @@ class Ledger:
         if old is None or not entry.seen <= old.seen:
             area[entry.case, entry.where] = entry
 
-    def page(self) -> str:
-        parts = [HEAD.format(command=COMMAND, machine=_machine())]
-        for name in sorted(self.areas):
+    def page(self, old: str = "") -> str:
+        """The page in Markdown. Of an old one, the sections of areas that did not run are kept."""
+        parts = dict(part.split("\n", 1) for part in old.split("\n## ")[1:])
+        for name, area in self.areas.items():
             title, _, text = self.texts[name].partition("\n")
-            parts.append(
-                f"## {title.rstrip('.')}\n\n{text.strip()}\n\n{_table([*self.areas[name].values()])}"
-            )
-        return "\n\n".join(part.replace("\n\n\n", "\n\n").strip() for part in parts) + "\n"
+            parts[title.rstrip(".")] = f"\n{text.strip()}\n\n{_table([*area.values()])}\n"
+        sections = (f"## {title}\n{parts[title].rstrip()}\n" for title in sorted(parts))
+        return "\n".join([HEAD.format(command=COMMAND, machine=_machine()), *sections])
 
 
 HEAD = """# Numbers on hard cases
 
-Every case of `tests/stability`: its result is finite and in range, and its error against a float64 reference of
-the same computation stays within the bound. A cell is the largest error seen, then the bound in brackets; `exact` means
-that no difference is allowed and none was seen. This page is written by
+Every case of `tests/stability`: its result is finite and in range, and its error against a float64 reference
+of the same computation stays within the bound. A cell is the largest error seen, then the bound in brackets;
+`exact` means that no difference is allowed and none was seen. This page is written by
 
     {command}
 
-on {machine}"""
+on {machine}.
+"""
 
 
 def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
@@ -82,6 +85,7 @@ def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
         bound: float,
         unit: str = "",
         scale: npt.ArrayLike = 1.0,
+        shown: str = "",
     ) -> None:
         """Finite, and nowhere further from `want` than bound * scale; both are noted."""
         got, want = np.asarray(got), np.asarray(want)
@@ -89,7 +93,8 @@ def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
         assert np.isfinite(got).all(), f"{case}, {where}: the result is not finite"
         apart = np.abs(got.astype(np.float64) - want.astype(np.float64)) / scale
         seen = float(apart.max(initial=0))
-        ledger.note(module, Entry(case, where, unit, bound, seen))
+        shown = shown or (f"{seen:.2f}" if bound >= 0.1 else f"{seen:.1e}")
+        ledger.note(module, Entry(case, where, unit, bound, seen, shown))
         assert seen <= bound, f"{case}, {where}: off by {seen:.3g} {unit}; {bound:g} is allowed"
 
     return hold
@@ -99,9 +104,7 @@ def _table(entries: list[Entry]) -> str:
     columns = list(dict.fromkeys(entry.where for entry in entries))
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for entry in entries:
-        cell = "exact" if entry.bound == 0 else f"{entry.seen:.1e} ({entry.bound:.0e})"
-        if entry.bound >= 0.1:
-            cell = f"{entry.seen:.2f} ({entry.bound:g})"
+        cell = "exact" if entry.bound == 0 else f"{entry.shown} ({entry.bound:g})"
         rows.setdefault((entry.case, entry.unit), {})[entry.where] = cell
     lines = ["| case | error in | " + " | ".join(columns) + " |", "|---" * (2 + len(columns)) + "|"]
     for (case, unit), cells in rows.items():
@@ -121,4 +124,6 @@ def _machine() -> str:
 
 
 def write(ledger: Ledger, path: Path) -> None:
-    path.write_text(ledger.page(), encoding="utf-8")
+    """Write the page, or what ran of it into the page that is there."""
+    old = path.read_text("utf-8") if path.exists() else ""
+    path.write_text(ledger.page(old), encoding="utf-8")

@@ -1,22 +1,18 @@
 """Light: what is drawn, from nothing to everything.
 
-A photo of 44 x 60 pixels on a grid of 16 x 24 cells. `light on the grid`: the masked mean that the network sees,
-against float64, relative to its own value. `picture`: the whole way from pixels to pixels, 2 steps, guidance 2,
-against the whole way in float64.
+A photo of 44 x 60 pixels on a grid of some 256 cells. `light on the grid`: the masked mean that the network
+sees, against float64, relative to its own value. `picture`: the whole way from pixels to pixels, 2 steps,
+guidance 2, against the whole way in float64.
 """
 
 from __future__ import annotations
-
-from functools import partial
 
 import numpy as np
 import pytest
 import twin
 
-from dior_rt import Relighter
 from dior_rt.kernels import Strokes
 from dior_rt.relight import NOTHING_DRAWN
-from dior_rt.sampler import draw_noise
 
 SIZE = (44, 60)
 SMALLEST = np.finfo(np.float32).tiny  # what is below may be 0 on a device
@@ -71,9 +67,8 @@ CASES = {
 @pytest.fixture(scope="module")
 def expected(family, network):
     """The whole way in float64, by case, in codes of 8 bits."""
-    noise = partial(draw_noise, 5)
     return {
-        case: 255 * np.clip(twin.relight(family, network, *given, noise, steps=2, guidance=2.0), 0, 1)
+        case: 255 * np.clip(twin.relight(family, network, *given, seed=5, steps=2, guidance=2.0), 0, 1)
         for case, given in CASES.items()
     }
 
@@ -90,23 +85,23 @@ def test_light_on_the_grid(ops, family, hold, case):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_picture_on_every_device(bundles, ops, expected, hold, case):
-    relighter = Relighter(bundles["fp32"], device="cpu", ops=ops.name.split()[0], threads=1)
-    picture = relighter.relight(*CASES[case], steps=2, guidance=2.0, seed=5).picture
+def test_picture_on_every_device(relighter, ops, expected, hold, case):
+    loaded = relighter("fp32", ops.name.split()[0])
+    picture = loaded.relight(*CASES[case], steps=2, guidance=2.0, seed=5).picture
     hold(f"{case}: picture", ops.name.split()[0], picture, expected[case], CODES["fp32"], "1/255")
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("precision", ["fp16", "int8"])
-def test_picture_in_every_precision(bundles, expected, hold, precision, case):
-    relighter = Relighter(bundles[precision], device="cpu", ops="numpy", threads=1)
-    picture = relighter.relight(*CASES[case], steps=2, guidance=2.0, seed=5).picture
+def test_picture_in_every_precision(relighter, expected, hold, precision, case):
+    loaded = relighter(precision, "numpy")
+    picture = loaded.relight(*CASES[case], steps=2, guidance=2.0, seed=5).picture
     hold(f"{case}: picture", precision, picture, expected[case], CODES[precision], "1/255")
 
 
 @pytest.mark.parametrize("precision", CODES)
-def test_no_light_changes_nothing(bundles, ops, hold, precision):
-    relighter = Relighter(bundles[precision], device="cpu", ops=ops.name.split()[0], threads=1)
-    relit = relighter.relight(photo(), drawn((1, 1, 1), np.s_[:0]), steps=2)
+def test_no_light_changes_nothing(relighter, ops, hold, precision):
+    loaded = relighter(precision, ops.name.split()[0])
+    relit = loaded.relight(photo(), drawn((1, 1, 1), np.s_[:0]), steps=2)
     assert relit.notice == NOTHING_DRAWN
     hold("none: picture", ops.name.split()[0], relit.picture, photo(), 0, "1/255")

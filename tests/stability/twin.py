@@ -21,6 +21,7 @@ from onnx.reference.op_run import OpRun
 from dior_rt.family import Family
 from dior_rt.family.mini import null
 from dior_rt.kernels import Strokes
+from dior_rt.sampler import draw_noise
 
 Array = NDArray[np.float64]
 Velocity = Callable[[Array, float], Array]
@@ -51,19 +52,31 @@ def overlaps(pixels: int, cells: int) -> Array:
     return np.clip(np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel), 0, 1)
 
 
+def light_of(picture: NDArray) -> Array:
+    """sRGB samples of any dtype -> linear light."""
+    if picture.dtype.kind == "f":
+        return decode(picture)
+    return decode(unit(np.arange(np.iinfo(picture.dtype).max + 1).astype(picture.dtype)))[picture]
+
+
 def area_sum(values: Array, grid: tuple[int, int]) -> Array:
     """(H, W, C) -> (h, w, C): the sum over each cell's area."""
     down, across = overlaps(values.shape[0], grid[0]), overlaps(values.shape[1], grid[1])
-    return np.einsum("iy,yxc->ixc", down, np.einsum("jx,yxc->yjc", across, values))
+    return np.einsum("jx,ixc->ijc", across, np.tensordot(down, values, 1))
 
 
 def reduce_photo(photo: NDArray, grid: tuple[int, int]) -> Array:
-    """The mean linear light of each cell."""
-    return area_sum(decode(unit(photo)), grid) * (grid[0] * grid[1] / (photo.shape[0] * photo.shape[1]))
+    """The mean linear light of each cell; of many rows, some at a time."""
+    (height, width), total = photo.shape[:2], np.zeros((grid[0], photo.shape[1], 3))
+    down, across = overlaps(height, grid[0]), overlaps(width, grid[1])
+    for top in range(0, height, 500):
+        rows = slice(top, top + 500)
+        total += np.tensordot(down[:, rows], light_of(photo[rows]), 1)
+    return np.einsum("jx,ixc->ijc", across, total) * (grid[0] * grid[1] / (height * width))
 
 
 def reduce_strokes(light: NDArray, mask: NDArray, grid: tuple[int, int]) -> tuple[Array, Array]:
-    """(light, mask) of each cell; light is linear. The largest values are taken out, so that nothing underflows."""
+    """(light, mask) of each cell; light is linear."""
     weight = mask.astype(np.float64)[..., None]
     light = np.where(weight > 0, light.astype(np.float64), 0)
     total, area = area_sum(light * weight, grid), area_sum(weight, grid)
@@ -85,7 +98,7 @@ def transfer(
     (height, width), (rows, columns) = size or photo.shape[:2], source.shape[:2]
     v = unit(photo)
     g, cell_g = _lightness(v), _lightness(encode(source))
-    log_r = _sharpened(np.log2((relit + E) / (source + E)))
+    root = _sharpened(np.sqrt((relit + E) / (source + E)))
     y = ((corner[0] + np.arange(v.shape[0]) + 0.5) * rows / height - 0.5)[:, None]
     x = (corner[1] + np.arange(v.shape[1]) + 0.5) * columns / width - 0.5
     i, j = np.floor(y + 0.5).astype(int), np.floor(x + 0.5).astype(int)
@@ -95,10 +108,10 @@ def transfer(
         cell = np.clip(near[0], 0, rows - 1), np.clip(near[1], 0, columns - 1)
         likeness = rough_reciprocal(1 + ((g - cell_g[cell]) / SIGMA) ** 2)
         weight = (_spline(y - near[0]) * _spline(x - near[1]) * likeness)[..., None]
-        total += weight * log_r[cell]
+        total += weight * root[cell]
         weights += weight
-    light = decode(v)
-    return encode(light + (light + E) * (np.exp2(total / weights) - 1))
+    light = light_of(photo)
+    return encode((light + E) * (total / weights) ** 2 - E)
 
 
 def rough_reciprocal(q: Array) -> Array:
@@ -151,12 +164,29 @@ class Network:
         return velocity
 
 
+def relight_grid(
+    family: Family[Any],
+    network: Network,
+    source: Array,
+    strokes: Strokes,
+    seed: int,
+    steps: int,
+    guidance: float,
+) -> Array:
+    """The light grid `source` (h, w, 3) under strokes of its size, linear; seed draws the noise."""
+    encoded = np.clip(encode(source), 0, 1).astype(np.float32)
+    condition = family.encode(encoded, strokes, "relight")
+    noise, sigmas = draw_noise(seed, family.noise_shape(condition)), family.sigmas(steps, condition)
+    x0 = euler(network.velocity(condition, guidance), noise, sigmas)
+    return decode(family.decode_relit(x0, condition))
+
+
 def relight(
     family: Family[Any],
     network: Network,
     photo: NDArray,
     strokes: Strokes,
-    noise: Callable[[tuple[int, ...]], NDArray],
+    seed: int,
     steps: int,
     guidance: float,
 ) -> Array:
@@ -165,10 +195,7 @@ def relight(
     source = reduce_photo(photo, grid)
     light, mask = reduce_strokes(strokes.light, strokes.mask, grid)
     drawn = Strokes(light.astype(np.float32), mask.astype(np.float32))
-    condition = family.encode(np.clip(encode(source), 0, 1).astype(np.float32), drawn, "relight")
-    velocity = network.velocity(condition, guidance)
-    x0 = euler(velocity, noise(family.noise_shape(condition)), family.sigmas(steps, condition))
-    return transfer(photo, source, decode(family.decode_relit(x0, condition)))
+    return transfer(photo, source, relight_grid(family, network, source, drawn, seed, steps, guidance))
 
 
 def attention(q: Array, k: Array, v: Array) -> Array:
@@ -225,13 +252,13 @@ def _lightness(encoded: Array) -> Array:
     return np.clip(encoded @ [0.25, 0.5, 0.25], 0, 1)
 
 
-def _sharpened(log_r: Array) -> Array:
-    """log R plus what the spline will blur of it, within the range of the 3 x 3 neighbours."""
-    rows, columns = log_r.shape[:2]
-    padded = np.pad(log_r, ((1, 1), (1, 1), (0, 0)), mode="edge")
+def _sharpened(values: Array) -> Array:
+    """The values plus what the spline will blur of them, within the range of the 3 x 3 neighbours."""
+    rows, columns = values.shape[:2]
+    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
     around = np.stack([padded[i : i + rows, j : j + columns] for i, j in np.ndindex(3, 3)])
     kernel = np.outer([1, 4, 1], [1, 4, 1]).ravel() / 36
-    return np.clip(2 * log_r - np.tensordot(kernel, around, 1), around.min(0), around.max(0))
+    return np.clip(2 * values - np.tensordot(kernel, around, 1), around.min(0), around.max(0))
 
 
 def _spline(d: Array) -> Array:
