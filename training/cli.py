@@ -171,6 +171,25 @@ def stage2(
         fit_stage2(make, renders, load_scenes(pairs, photos), out, plan, mixture, bar.show)
 
 
+@app.command()
+def synthbench(
+    out: Annotated[Path, typer.Option(help="Folder of the benchmark; what is there already is kept.")],
+    pairs: Annotated[int, typer.Option(min=1, max=1000)] = 600,
+    seed: Annotated[int, typer.Option(min=0, max=90, help="Of other seeds, other scenes.")] = 0,
+    resolution: Annotated[int, typer.Option(min=16, help="Pixels a side.")] = 128,
+    samples: Annotated[int, typer.Option(min=1, help="Rays a pixel and source.")] = 32,
+    shard: Annotated[str, typer.Option(help="i/n: this process's share; run one process a core.")] = "0/1",
+) -> None:
+    """Render SynthBench: pairs of very different light, with true maps, for `eval`. Resumable."""
+    from dior_rt.training.evaluation.synthbench import Recipe, render_synthbench
+
+    share = _shard(shard)
+    with typer.progressbar(length=len(range(share[0], pairs, share[1])), label="pairs") as bar:
+        render_synthbench(
+            out, Recipe(pairs, seed, resolution, samples), share, lambda done, total: bar.update(1)
+        )
+
+
 @app.command(name="eval")
 def evaluate(
     method: Annotated[Path, typer.Argument(help="Folder of a bundle, or of another method's pictures.")],

@@ -1,117 +1,175 @@
-"""The evaluation: relighters whose figures are known beforehand, and a bundle from end to end."""
+"""The evaluation: baselines with known answers, methods beside them, the report; a bundle from end to end."""
+
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from skimage.metrics import peak_signal_noise_ratio
+from PIL import Image
 
+from dior_rt.errors import BundleError, InputError
 from dior_rt.kernels import NumpyOps
 from dior_rt.relight import Relighter
-from dior_rt.training.evaluate import (
-    HUES,
-    Settings,
-    accuracy,
-    evaluate,
-    hue_angle,
-    hue_error,
-    keep_psnr,
-    markdown,
-    prepare,
-    response,
-    score,
-)
-from dior_rt.training.triplets import pair
+from dior_rt.training.evaluation.baselines import gain, match, quotient
+from dior_rt.training.evaluation.benchmarks import open_benchmarks
+from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_methods
+from dior_rt.training.evaluation.report import CELL, GAP, as_json, contact_sheet, markdown, write_report
+from dior_rt.training.evaluation.run import Evaluation, Figure, Plan, evaluate, run
 
 OPS = NumpyOps()
+PHOTO = np.random.default_rng(0).integers(20, 90, (24, 32, 3), dtype=np.uint8)
 
 
-def copying(photo, strokes):
-    return photo
+@pytest.fixture(scope="module")
+def answers(renders, tmp_path_factory):
+    """Another method's pictures for both benchmarks of the renders: it knows the truth of "replace"."""
+    folder = tmp_path_factory.mktemp("another")
+    for benchmark in open_benchmarks(renders):
+        for task in benchmark:
+            picture = task.truth if benchmark.name == "replace" else task.source
+            Image.fromarray(picture).save(folder / f"{task.name}.png")
+    return folder
 
 
-def painting(photo, strokes):
-    """Puts a twentieth of the strokes' own light on the picture."""
-    painted = OPS.encode_srgb(strokes.light * np.float32(0.05), np.uint8)
-    return np.where(strokes.mask[..., None] > 0, painted, photo)
+def test_gain_undoes_a_gain() -> None:
+    brighter = OPS.encode_srgb(OPS.decode_srgb(PHOTO) * np.array([2, 3, 0.5], np.float32), np.uint8)
+    assert np.abs(gain(PHOTO, brighter).astype(int) - brighter).max() <= 1
+    assert np.array_equal(gain(PHOTO, PHOTO), PHOTO)
+    assert not gain(np.zeros_like(PHOTO), PHOTO).any()  # black has no gain
 
 
-def shining(photo, strokes):
-    """Adds a fifth of the strokes' light to the picture."""
-    return OPS.encode_srgb(OPS.decode_srgb(photo) + strokes.light * np.float32(0.2), np.uint8)
+def test_match_undoes_a_linear_change_of_codes() -> None:
+    changed = np.rint(PHOTO * np.array([2, 1.5, 1]) + np.array([10, 0, 40])).astype(np.uint8)
+    assert np.abs(match(PHOTO, changed).astype(int) - changed).max() <= 1
+    flat = np.full_like(PHOTO, 77)
+    assert (match(PHOTO, flat) == 77).all() and (match(flat, flat) == 77).all()
 
 
-def test_a_copy_scores_as_the_copy(views) -> None:
-    row = accuracy(copying, views, "change", "strokes")
-    assert row.relit == row.copy and row.pictures == len(views) and 5 < row.copy.psnr < 100
+def test_the_quotient_of_matte_white_light_is_exact() -> None:
+    """A matte picture is albedo * Lumi map, so the quotient of true maps leads to the truth."""
+    rng = np.random.default_rng(1)
+    albedo = rng.uniform(0.2, 0.8, (24, 32, 3)).astype(np.float32)
+    source, target = rng.uniform(0.3, 1, (2, 24, 32, 3)).astype(np.float32)
+    photo, truth = (OPS.encode_srgb(albedo * light, np.uint8) for light in (source, target))
+    relit = quotient(photo, source, target)
+    assert np.abs(relit.astype(float) - truth).mean() < 2 < np.abs(photo.astype(float) - truth).mean()
+    assert np.array_equal(quotient(photo, source, source), photo)
 
 
-def test_the_truth_scores_best(views) -> None:
-    truths = iter(
-        [pair(np.random.default_rng([k, 1]), view, "replace").relit for k, view in enumerate(views)]
+def test_the_quotient_of_maps_smaller_than_the_photo() -> None:
+    ones = np.ones((6, 8, 3), np.float32)
+    twice = OPS.decode_srgb(
+        quotient(PHOTO, ones, ones * np.float32(2.02) - np.float32(0.02) + np.float32(0.02))
     )
-    row = accuracy(lambda photo, strokes: OPS.encode_srgb(next(truths), np.uint8), views, "replace", "dense")
-    assert row.relit.rmse == 0 and row.relit.psnr == pytest.approx(100) and row.relit.ssim == pytest.approx(1)
-    assert row.copy.psnr < row.relit.psnr
+    assert np.median(twice / OPS.decode_srgb(PHOTO)) == pytest.approx(2, rel=0.03)
 
 
-def test_scores_agree_with_scikit_image() -> None:
-    rng = np.random.default_rng(0)
-    pictures, truths = rng.integers(0, 256, (2, 3, 16, 16, 3), dtype=np.uint8)
-    got = score(list(pictures), list(truths))
-    expected = [peak_signal_noise_ratio(a, b) for a, b in zip(truths, pictures, strict=True)]
-    assert got.psnr == pytest.approx(np.mean(expected))
-    difference = pictures.astype(float) - truths
-    assert got.rmse == pytest.approx(np.sqrt((difference**2).mean()))
+def test_another_method_stands_beside_the_baselines(renders, answers) -> None:
+    (method,) = open_methods(answers, Settings())
+    assert isinstance(method, Pictures)
+    replaced, changed = (run(method, found)[0] for found in open_benchmarks(renders))
+    rows = {row.method: row for row in replaced.rows}
+    assert list(rows) == ["copy", "gain", "mean and deviation", "quotient", answers.name]
+    assert rows["quotient"].control == "true maps"  # nothing estimates here
+    best = rows[answers.name].figures
+    assert best["RMSE"] == Figure(0, 0, 0) and best["PSNR"].mean == pytest.approx(100)
+    assert best["SSIM"].mean == pytest.approx(1)
+    assert rows["copy"].figures["PSNR"].mean < rows["quotient"].figures["PSNR"].mean
+    assert rows["copy"].figures["RMSE"].low < rows["copy"].figures["RMSE"].mean
+    rows = {row.method: row for row in changed.rows}
+    assert rows[answers.name].figures == rows["copy"].figures
 
 
-def test_light_in_proportion_has_slope_one_and_a_copy_slope_zero(views) -> None:
-    assert response(painting, views).slope == pytest.approx(1, abs=0.1)
-    assert response(painting, views).monotonic == 1
-    still = response(copying, views)
-    assert still.slope == pytest.approx(0, abs=1e-9) and still.monotonic == 0 and still.dabs == len(views)
+def test_gain_is_never_worse_than_copy_in_linear_mean(renders) -> None:
+    for task in open_benchmarks(renders)[0]:
+        wanted = OPS.decode_srgb(task.truth).mean((0, 1))
+        got = OPS.decode_srgb(gain(task.source, task.truth)).mean((0, 1))
+        had = OPS.decode_srgb(task.source).mean((0, 1))
+        assert (np.abs(got - wanted) <= np.abs(had - wanted) + 0.01).all()
 
 
-def test_light_added_in_the_dab_s_colour_has_its_hue(views) -> None:
-    assert hue_error(shining, views) < 10
-    assert hue_error(copying, views) == 90
+def test_pictures_that_are_missing_or_of_another_size(renders, answers, tmp_path) -> None:
+    task = next(iter(open_benchmarks(renders)[0]))
+    with pytest.raises(InputError, match=f"{task.name}.png: there is no such file"):
+        Pictures(tmp_path).picture(task)
+    Image.new("RGB", (5, 4)).save(tmp_path / f"{task.name}.png")
+    with pytest.raises(InputError, match="has 5 x 4 pixels and should have 24 x 24"):
+        Pictures(tmp_path).picture(task)
 
 
-def test_hue_angles() -> None:
-    red, green, blue = np.eye(3)
-    assert hue_angle(red, 5 * red + 1) == pytest.approx(0, abs=1e-4)
-    assert hue_angle(red, green) == pytest.approx(120) and hue_angle(blue, -blue) == pytest.approx(180)
-    assert hue_angle(red, np.ones(3)) == pytest.approx(90)
-    assert all(hue_angle(np.array(hue), np.array(hue)) < 1e-3 for hue in HUES)
+def test_a_folder_that_is_no_method(tmp_path) -> None:
+    with pytest.raises(BundleError):
+        open_methods(tmp_path, Settings())
 
 
-def test_keeping_is_judged_where_no_stroke_speaks(views) -> None:
-    assert keep_psnr(copying, views) == pytest.approx(100)
+def test_a_bundle_is_measured_with_its_own_settings_and_those_asked_for(mini_bundle, renders) -> None:
+    own, asked = open_methods(mini_bundle, Settings(steps=1, noise_scale=0.0))
+    manifest = Relighter(mini_bundle, ops="numpy").bundle.manifest
+    assert own.settings == Settings(manifest.steps, manifest.guidance, manifest.noise_scale)
+    assert asked.settings == Settings(1, manifest.guidance, 0.0)
+    assert len(open_methods(mini_bundle, Settings(steps=manifest.steps))) == 1
+    task = next(iter(open_benchmarks(renders)[0]))
+    strokes = task.control("dense")
+    assert not np.array_equal(own.relight(task.source, strokes), asked.relight(task.source, strokes))
 
-    def spoiling(photo, strokes):
-        return np.where(strokes.mask[..., None] > 0, 255 - photo, photo)
 
-    assert keep_psnr(spoiling, views) == pytest.approx(100)
-    assert keep_psnr(lambda photo, strokes: 255 - photo, views) < 30
+def test_a_bundle_from_end_to_end(mini_bundle, renders, tmp_path) -> None:
+    plan = Plan(views=2, dabs=1)
+    Image.fromarray(np.tile(PHOTO, (2, 2, 1))).save(tmp_path / "photo.png")
+    plan = replace(plan, photos=tmp_path)
+    evaluations, examples = evaluate(mini_bundle, renders, Settings(steps=1), plan)
+    assert [evaluation.settings.steps for evaluation in evaluations] == [4, 1]
+    assert len(examples) == 4 and all(example.strokes for example in examples)
+    for evaluation in evaluations:
+        assert [table.benchmark for table in evaluation.tables] == ["replace", "change"]
+        for table in evaluation.tables:
+            assert table.pictures == 2 and table.estimate and np.isfinite(table.estimate.mean)
+            controls = [row.control for row in table.rows]
+            assert controls[3:] == ["true maps", "estimated maps", "dense", "strokes"]
+            assert table.rows[-1].seconds > 0
+        assert evaluation.control.response.dabs == 1 and evaluation.borders.photos == 1
+    again, _ = evaluate(mini_bundle, renders, Settings(steps=1), plan)
+    assert again[0].control == evaluations[0].control
+    text = markdown(evaluations)
+    assert text.count("| strokes |") == 4 and "cut from the true Lumi map" in text
+    assert json.loads(as_json(evaluations))[1]["control"]["response"]["dabs"] == 1
+    write_report(tmp_path / "report", evaluations, examples)
+    assert (tmp_path / "report" / "report.md").read_text() == text + "\n"
+    assert json.loads((tmp_path / "report" / "report.json").read_text())
+    with Image.open(tmp_path / "report" / "contact.png") as sheet:
+        assert sheet.width == 4 * (CELL + GAP) + GAP
 
 
-def test_a_bundle_is_evaluated_with_the_settings_asked_for(mini_bundle, views) -> None:
-    relighter = Relighter(mini_bundle, ops="numpy")
-    manifest = relighter.bundle.manifest
-    own, relight = prepare(relighter, Settings())
-    assert own == Settings(manifest.steps, manifest.guidance, manifest.noise_scale)
-    evaluation = evaluate(relighter, views[:2], Settings(steps=1, noise_scale=0.0), dabs=1)
-    assert evaluation.settings == Settings(1, manifest.guidance, 0.0)
-    assert relighter.bundle.manifest == manifest
-    assert [(row.kind, row.drawn) for row in evaluation.accuracy] == [
-        ("replace", "dense"),
-        ("replace", "strokes"),
-        ("change", "dense"),
-        ("change", "strokes"),
-    ]
-    again = evaluate(relighter, views[:2], Settings(steps=1, noise_scale=0.0), dabs=1)
-    assert again.response == evaluation.response and again.keep_psnr == evaluation.keep_psnr
-    table = markdown(evaluation)
-    assert table.startswith("1 steps") and table.count("\n| ") == 5
-    photo = np.full((24, 24, 3), 90, np.uint8)
-    strokes = OPS.sparsify(np.ones((24, 24, 3), np.float32), "dense", 0)
-    quiet = prepare(relighter, Settings(noise_scale=0.0))[1]
-    assert not np.array_equal(relight(photo, strokes), quiet(photo, strokes))
+def test_real_pairs_are_driven_by_light_estimated_from_the_target(mini_bundle, tmp_path) -> None:
+    for direction in range(2):
+        grey = np.roll(np.tile(PHOTO, (2, 2, 1)), 9 * direction, axis=1)
+        (tmp_path / "everett_d").mkdir(exist_ok=True)
+        Image.fromarray(grey).save(tmp_path / "everett_d" / f"dir_{direction}_mip6.jpg")
+    (model,) = open_methods(mini_bundle, Settings())
+    assert isinstance(model, Model)
+    (found,) = open_benchmarks(tmp_path)
+    table, examples = run(model, found.first(1))
+    assert "estimated from the target by the same model" in table.control and table.estimate is None
+    assert [row.control for row in table.rows][3:] == ["estimated maps", "dense", "strokes"]
+    task = next(iter(found))
+    lumi, strokes = model.estimate(task.truth), examples[0].strokes
+    drawn = strokes.mask > 0
+    assert np.array_equal(strokes.light[drawn], lumi[drawn])  # of the target, not of the source
+    assert "estimated from the target" in markdown([Evaluation(model.name, model.settings, (table,))])
+
+
+def test_the_contact_sheet_shows_what_it_says(renders) -> None:
+    benchmark = open_benchmarks(renders)[0]
+    method = Pictures(renders)
+    (task,) = benchmark.first(1)
+    from dior_rt.training.evaluation.run import Example
+
+    strokes = task.control("strokes")
+    sheet = np.asarray(contact_sheet([Example(task, strokes, 255 - task.source)]))
+    assert method.name == renders.name and sheet.shape[0] == 14 + 24 + 14 + GAP
+    cells = [sheet[28:52, GAP + k * (CELL + GAP) :][:, :24] for k in range(4)]
+    assert np.array_equal(cells[0], task.source) and np.array_equal(cells[3], task.truth)
+    assert np.array_equal(cells[2], 255 - task.source)
+    assert (cells[1][strokes.mask == 0] == 128).all()
+    shown = OPS.encode_srgb(strokes.light, np.uint8)
+    assert np.array_equal(cells[1][strokes.mask > 0], shown[strokes.mask > 0])

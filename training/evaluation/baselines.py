@@ -1,0 +1,34 @@
+"""What needs no network. Gain and match are told the truth's colours: no one grade does better."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from dior_rt.training.evaluation.metrics import Photo, Raster
+from dior_rt.training.evaluation.tasks import OPS
+
+E: Final = np.float32(0.02)  # of display white; what the quotient trusts no darkness below
+
+
+def gain(source: Photo, truth: Photo) -> Photo:
+    """The source times one factor a channel, in linear light, that gives it the truth's mean."""
+    light, wanted = OPS.decode_srgb(source), OPS.decode_srgb(truth)
+    return OPS.encode_srgb(light * (wanted.mean((0, 1)) / np.maximum(light.mean((0, 1)), 1e-6)), np.uint8)
+
+
+def match(source: Photo, truth: Photo) -> Photo:
+    """The source with each channel's mean and standard deviation, as shown, those of the truth."""
+    codes, wanted = source.astype(np.float64), truth.astype(np.float64)
+    unit = (codes - codes.mean((0, 1))) / np.maximum(codes.std((0, 1)), 1e-6)
+    return np.clip(np.rint(unit * wanted.std((0, 1)) + wanted.mean((0, 1))), 0, 255).astype(np.uint8)
+
+
+def quotient(photo: Photo, source: Raster, target: Raster) -> Photo:
+    """photo * (target + e) / (source + e) in linear light, of two Lumi maps (h, w, 3).
+
+    Maps smaller than the photo reach it as the runtime's own light does: edge-aware.
+    """
+    before = OPS.reduce_photo(photo, source.shape[:2])
+    return OPS.transfer(photo, before, before * (target + E) / (source + E))  # type: ignore[return-value]

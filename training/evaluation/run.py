@@ -1,0 +1,241 @@
+"""A method over a benchmark: every picture scored beside the baselines."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from dior_rt.errors import InputError
+from dior_rt.kernels import Strokes
+from dior_rt.training.evaluation import control
+from dior_rt.training.evaluation.baselines import gain, match, quotient
+from dior_rt.training.evaluation.benchmarks import open_benchmarks, renders
+from dior_rt.training.evaluation.layouts import read_picture
+from dior_rt.training.evaluation.lpips import BACKBONES, Lpips
+from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_methods
+from dior_rt.training.evaluation.metrics import Photo, interval, psnr, rmse, scaled_psnr, ssim
+from dior_rt.training.evaluation.tasks import DRAWN, OPS, Benchmark, Task
+
+Measure = Callable[[Photo, Photo], float]
+MEASURES: Final[Mapping[str, Measure]] = {"PSNR": psnr, "RMSE": rmse, "SSIM": ssim}
+EXAMPLES: Final = 8  # of a benchmark, for the contact sheet
+SECONDS: Final = "seconds"
+PHOTOS: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+
+TRUE_CONTROL: Final = "The light is cut from the true Lumi map of the target."
+ESTIMATED_CONTROL: Final = (
+    "No true map is known: the light is estimated from the target by the same model, and drives the source."
+)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A mean over pictures and its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Figure:
+        """Of at least one value."""
+        return Figure(float(np.mean(values)), *interval(values))
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method's figures, by the measure's name. control: what light it was given. seconds: a picture."""
+
+    method: str
+    control: str
+    figures: dict[str, Figure]
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """estimate: PSNR in dB of the estimated map of the source, after the best global scale, where a true one
+    is known. control: where the light that methods are given comes from."""
+
+    benchmark: str
+    pictures: int
+    control: str
+    rows: tuple[Row, ...]
+    estimate: Figure | None
+
+
+@dataclass(frozen=True)
+class Example:
+    """What the contact sheet shows of one task."""
+
+    task: Task
+    strokes: Strokes | None
+    result: Photo
+
+
+@dataclass(frozen=True)
+class Control:
+    """See `control`; progress is None where no task has two strokes."""
+
+    response: control.Response
+    chroma: control.Chroma
+    progress: control.Progress | None
+    keep_psnr: float
+    add_psnr: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All that was measured of one method. settings: as used, or None for a folder of pictures."""
+
+    method: str
+    settings: Settings | None
+    tables: tuple[Table, ...]
+    control: Control | None = None
+    borders: control.Borders | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One picture for one task."""
+
+    method: str
+    control: str
+    picture: Photo
+    seconds: float | None = None
+    strokes: Strokes | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """views: pairs of each kind at most. dabs: views that the brush visits, on renders. lpips: whether to
+    measure it. photos: a folder of pictures in which to look for patch borders."""
+
+    views: int = 80
+    dabs: int = 10
+    lpips: bool = False
+    photos: Path | None = None
+
+
+def evaluate(
+    folder: Path, benchmark: Path, asked: Settings, plan: Plan
+) -> tuple[list[Evaluation], list[Example]]:
+    """A bundle with its own settings, and once more with those asked for where they differ; or the pictures
+    of another method. The examples are those of the first. Raises what reading raises."""
+    benchmarks = [found.first(plan.views) for found in open_benchmarks(benchmark)]
+    methods = open_methods(folder, asked)
+    measures = dict(MEASURES)
+    if plan.lpips:
+        measures |= {f"LPIPS {name}": Lpips(name) for name in BACKBONES}
+    evaluations, shown = [], []
+    for method in methods:
+        results = [run(method, found, measures) for found in benchmarks]
+        shown += [example for _, examples in results for example in examples] if method is methods[0] else []
+        brush, seams = None, None
+        if isinstance(method, Model):
+            brush = run_control(method, benchmark, plan.views, plan.dabs)
+            seams = run_borders(method, plan.photos) if plan.photos else None
+        settings = method.settings if isinstance(method, Model) else None
+        tables = tuple(table for table, _ in results)
+        evaluations.append(Evaluation(method.name, settings, tables, brush, seams))
+    return evaluations, shown
+
+
+def run(
+    method: Model | Pictures, benchmark: Benchmark, measures: Mapping[str, Measure] = MEASURES
+) -> tuple[Table, list[Example]]:
+    """The table of one benchmark, and its first EXAMPLES. Tasks come and go one by one."""
+    scores: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
+    estimates: list[float] = []
+    examples: list[Example] = []
+    for task in benchmark:
+        estimated = _estimated(method, task) if isinstance(method, Model) else None
+        if estimated and task.source_lumi is not None:
+            estimates.append(_estimate_psnr(estimated, task))
+        for answer in _answers(method, task, estimated):
+            figures = {name: measure(answer.picture, task.truth) for name, measure in measures.items()}
+            if answer.seconds is not None:
+                figures[SECONDS] = answer.seconds
+            scores[answer.method, answer.control].append(figures)
+        if len(examples) < EXAMPLES:
+            examples.append(Example(task, answer.strokes, answer.picture))  # of the last, the method's own
+    rows = tuple(_row(*key, figures) for key, figures in scores.items())
+    light = TRUE_CONTROL if benchmark.true_maps else ESTIMATED_CONTROL
+    estimate = Figure.of(estimates) if estimates else None
+    return Table(benchmark.name, len(benchmark), light, rows, estimate), examples
+
+
+def run_control(model: Model, folder: Path, views: int, dabs: int) -> Control | None:
+    """How a model answers to the brush, which visits `dabs` views; None where there are no renders."""
+    if not dabs or not renders(folder):
+        return None
+    still, changed, kept, added = (
+        renders(folder, (kind,), seed)[0].first(count)
+        for kind, seed, count in (
+            ("keep", 3, dabs),
+            ("change", 1, dabs),
+            ("keep", 2, views),
+            ("add", 4, views),
+        )
+    )
+    return Control(
+        control.response(model.relight, still),
+        control.chroma(model.relight, still),
+        control.progress(model.relight, changed),
+        control.keep_psnr(model.relight, kept),
+        control.keep_psnr(model.relight, added),
+    )
+
+
+def run_borders(model: Model, folder: Path) -> control.Borders:
+    """Over the pictures of a folder. Raises InputError where there are none."""
+    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTOS)
+    if not paths:
+        raise InputError(f"There are no pictures in {folder}.")
+    return control.borders(model.relight, model.estimate, model.grid, map(read_picture, paths))
+
+
+def _row(method: str, drawn: str, scored: list[dict[str, float]]) -> Row:
+    seconds = [figures.pop(SECONDS) for figures in scored if SECONDS in figures]
+    figures = {name: Figure.of([one[name] for one in scored]) for name in scored[0]}
+    return Row(method, drawn, figures, float(np.mean(seconds)) if seconds else None)
+
+
+def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> Iterator[Answer]:
+    """The baselines, then the method."""
+    yield Answer("copy", "", task.source)
+    yield Answer("gain", "target's colours", gain(task.source, task.truth))
+    yield Answer("mean and deviation", "target's colours", match(task.source, task.truth))
+    for maps, known in (("true maps", task), ("estimated maps", estimated)):
+        if known and known.source_lumi is not None and known.target_lumi is not None:
+            yield Answer("quotient", maps, quotient(task.source, known.source_lumi, known.target_lumi))
+    if isinstance(method, Pictures):
+        strokes = task.control("strokes") if task.target_lumi is not None else None
+        yield Answer(method.name, "", method.picture(task), strokes=strokes)
+        return
+    driving = task if task.target_lumi is not None else estimated
+    assert driving
+    for drawn in DRAWN:
+        strokes = driving.control(drawn)
+        began = time.perf_counter()
+        picture = method.relight(task.source, strokes)
+        yield Answer(method.name, drawn, picture, time.perf_counter() - began, strokes)
+
+
+def _estimated(model: Model, task: Task) -> Task:
+    """The task with the light that the model sees in its two pictures, on the light grid."""
+    source, target = model.estimate(task.source), model.estimate(task.truth)
+    return replace(task, source_lumi=source, target_lumi=target, mask=None, interest=None)
+
+
+def _estimate_psnr(estimated: Task, task: Task) -> float:
+    assert estimated.source_lumi is not None and task.source_lumi is not None
+    grid = estimated.source_lumi.shape[:2]
+    everywhere = np.ones(task.source_lumi.shape[:2], np.float32)
+    return scaled_psnr(estimated.source_lumi, OPS.reduce_strokes(task.source_lumi, everywhere, grid).light)

@@ -1,0 +1,137 @@
+"""SynthBench: rendered pairs whose lights differ much, with their true Lumi maps, made from a seed.
+
+    {out}/synthbench.json          format, seed, pairs, resolution and samples
+    {out}/{pair}/source.png        the photo, 8-bit sRGB
+    {out}/{pair}/target.png        the truth
+    {out}/{pair}/*_lumi.exr        their Lumi maps, linear
+    {out}/{pair}/mask.png          white where the benchmark's strokes speak; their light is the target's map
+
+Copying the source scores at most MOST_COPY dB on every pair. Scene numbers lie above all those that
+`dior-rt train render` can reach, so no geometry was ever trained on; in every second pair stands a human
+figure, a kind of thing that training has none of.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from dior_rt.errors import InputError
+from dior_rt.files import make_folder, replacing
+from dior_rt.pictures import Photo, write_photo
+from dior_rt.records import parse, read_json
+from dior_rt.strokes import write_lumi
+from dior_rt.training.evaluation.benchmarks import HEAD, LAST
+from dior_rt.training.evaluation.metrics import psnr
+from dior_rt.training.evaluation.people import person
+from dior_rt.training.evaluation.tasks import OPS, Task
+from dior_rt.training.render import Stage, mitsuba, view
+from dior_rt.training.scenes import Scene, scene
+from dior_rt.training.triplets import pair
+
+MOST_COPY: Final = 15.0  # dB
+DRAWS: Final = 200  # of lights in a scene, before the next scene is tried
+FIRST: Final = 901_000_000  # the first scene number; `render` has those below
+STRIDE: Final = 1000  # scene numbers from pair to pair; of seeds, 1000 pairs
+FORMAT: Final = 1
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a SynthBench is made from. resolution: pixels a side. samples: rays a pixel and source."""
+
+    pairs: int = 600
+    seed: int = 0
+    resolution: int = 128
+    samples: int = 32
+    format: int = FORMAT
+
+
+def render_synthbench(
+    out: Path,
+    recipe: Recipe,
+    shard: tuple[int, int] = (0, 1),
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Render the pairs that are not there yet. shard: (index, count), this process's share.
+
+    Raises InputError where nothing can be written, or where the folder holds another recipe's pairs.
+    """
+    mitsuba()  # where it or the figures are missing, no folder is made
+    person(np.random.default_rng(0), 1.0, 0.0, np.zeros(3))
+    make_folder(out)
+    _agree(out / HEAD, recipe)
+    index, shards = shard
+    mine = range(index, recipe.pairs, shards)
+    for done, number in enumerate(mine):
+        folder = out / f"{number:04d}"
+        if not (folder / LAST).exists():
+            _save(folder, make(number, recipe))
+        if progress:
+            progress(done + 1, len(mine))
+
+
+def make(number: int, recipe: Recipe) -> Task:
+    """The pair of that number: of the first scene from its own place on that has lights different enough."""
+    first = FIRST + recipe.seed * 1_000 * STRIDE + number * STRIDE
+    for scene_number in count(first):
+        described = staged(scene_number, with_person=number % 2 == 1)
+        seen = view(
+            Stage.load(described.things),
+            described,
+            described.cameras[0],
+            scene_number,
+            recipe.resolution,
+            recipe.samples,
+        )
+        rng = np.random.default_rng([scene_number, 5])
+        for _ in range(DRAWS):
+            sample = pair(rng, seen, "replace")
+            source, truth = (OPS.encode_srgb(linear, np.uint8) for linear in (sample.photo, sample.relit))
+            if psnr(source, truth) <= MOST_COPY:
+                mask = OPS.sparsify(sample.target, "strokes", number).mask
+                return Task(f"{number:04d}", source, truth, sample.source, sample.target, mask, seed=number)
+    raise AssertionError("numbers do not end")
+
+
+def staged(number: int, with_person: bool) -> Scene:
+    """The scene of that number by one camera, with a human figure in front or without."""
+    described = scene(number, cameras=1)
+    if not with_person:
+        return described
+    rng: Generator = np.random.default_rng([number, 6])
+    at = np.array([rng.uniform(-0.6, 0.6), 0.0, rng.uniform(0.1, 0.9)])
+    figure = person(rng, rng.uniform(1.3, 1.7), rng.uniform(-0.9, 0.9), at)
+    return replace(described, things=(*described.things, *figure))
+
+
+def _agree(path: Path, recipe: Recipe) -> None:
+    """Write the recipe, or see that it is the one that is there."""
+    if not path.exists():
+        with replacing(path) as file:
+            file.write(json.dumps(asdict(recipe), indent=2).encode())
+    try:
+        there = parse(Recipe, read_json(path, 1 << 16))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} describes no SynthBench.") from error
+    if replace(there, pairs=recipe.pairs) != recipe:
+        raise InputError(f"{path.parent} holds a SynthBench of another recipe; name another folder.")
+
+
+def _save(folder: Path, task: Task) -> None:
+    """Write a pair; the truth last, so that a pair that has it is whole."""
+    assert task.source_lumi is not None and task.target_lumi is not None and task.mask is not None
+    make_folder(folder)
+    white = (task.mask * 255).astype(np.uint8)
+    write_lumi(folder / "source_lumi.exr", task.source_lumi, {})
+    write_lumi(folder / "target_lumi.exr", task.target_lumi, {})
+    write_photo(folder / "mask.png", Photo(np.stack([white] * 3, axis=-1)), {})
+    write_photo(folder / "source.png", Photo(task.source), {})
+    write_photo(folder / LAST, Photo(task.truth), {})
