@@ -32,6 +32,7 @@ from dior_rt.training.fit import Plan, Progress, rendered, run
 from dior_rt.training.network import RELIT_SCALE, decode_light
 
 MULTIPLE: Final = 32
+LOCAL: Final[dict[str, Any]] = {"local_files_only": True, "use_safetensors": True}
 SAID: Final = {MODES["relight"]: Prompts.relight, MODES["estimate"]: Prompts.estimate}
 ADAPTER: Final = "light"
 TARGETS: Final = [
@@ -170,10 +171,9 @@ class QwenLora:
         """
         prompts = prompts or embed_prompts(folder)
         try:
-            transformer = QwenImageTransformer2DModel.from_pretrained(
-                folder / "transformer", torch_dtype=dtype
-            )
-            vae = AutoencoderKLQwenImage.from_pretrained(folder / "vae")
+            weights = folder / "transformer"
+            transformer = QwenImageTransformer2DModel.from_pretrained(weights, torch_dtype=dtype, **LOCAL)
+            vae = AutoencoderKLQwenImage.from_pretrained(folder / "vae", **LOCAL)
         except (OSError, ValueError, RuntimeError) as error:
             raise InputError(f"Cannot read the model in {folder}: {reason(error)}.") from error
         self.out, self.pictures = out, Pictures(vae, area)
@@ -224,8 +224,8 @@ def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor
     Raises InputError where the folder has no text encoder.
     """
     try:
-        tokenizer = Qwen2Tokenizer.from_pretrained(folder / "tokenizer")
-        encoder = Qwen2_5_VLForConditionalGeneration.from_pretrained(folder / "text_encoder")
+        tokenizer = Qwen2Tokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
+        encoder = Qwen2_5_VLForConditionalGeneration.from_pretrained(folder / "text_encoder", **LOCAL)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"Cannot read the text encoder in {folder}: {reason(error)}.") from error
     embeddings = {}

@@ -24,6 +24,7 @@ from dior_rt.export.qwen.sources import IN_FOLDER, MULTIPLE, Files, Sources
 from dior_rt.export.qwen.text import write_text_encoder
 from dior_rt.export.qwen.transformer import THETA, write_transformer
 from dior_rt.export.qwen.vae import write_decoder, write_encoder
+from dior_rt.export.qwen.weights import Checkpoint
 from dior_rt.family.qwen_config import FILE, LUMI_PEAK, MODULATION, PROMPTS, QwenSettings, TextSettings
 from dior_rt.family.qwen_layers import Layers
 from dior_rt.family.qwen_prompt import PromptEncoder
@@ -276,6 +277,8 @@ def _check_room(sources: Sources, recipe: Recipe, out: Path) -> None:
     needed = _bytes(sources, recipe, recipe.precision)
     if recipe.precision != "fp32":
         needed += _bytes(sources, recipe, "fp32")
+    if recipe.prompt_cache:
+        needed += _text_bytes(sources, "fp32")  # for a while
     parent = next(folder for folder in out.resolve().parents if folder.exists())
     free = shutil.disk_usage(parent).free
     if free < needed:
@@ -286,13 +289,19 @@ def _check_room(sources: Sources, recipe: Recipe, out: Path) -> None:
 
 
 def _bytes(sources: Sources, recipe: Recipe, precision: Precision) -> float:
-    """About what a bundle takes; modulation is float32 in all of them."""
-    base, text = sources.transformer_base, sources.text_weights
-    sizes = {name: math.prod(base.shape(name)) for name in base.names}
-    modulation = sum(size for name, size in sizes.items() if "_mod.1." in name)
-    total = BYTES[precision] * (sum(sizes.values()) - modulation)
-    total += 4 * modulation if recipe.free_steps else 0
-    if not recipe.prompt_cache:
-        layers = (name for name in text.names if name.startswith(("model.layers.", "visual.")))
-        total += BYTES[precision] * sum(math.prod(text.shape(name)) for name in layers)
-    return total
+    """About what a bundle takes; modulation and the autoencoder are float32 in all of them."""
+    base, config = sources.transformer_base, sources.transformer
+    modulation = sum(math.prod(base.shape(name)) for name in base.names if "_mod.1." in name)
+    table = (recipe.steps + 1) * (12 * config.num_layers + 2) * config.width
+    total = BYTES[precision] * (_count(base) - modulation) + 4 * _count(sources.vae_weights)
+    total += 4 * (modulation if recipe.free_steps else table)
+    return total if recipe.prompt_cache else total + _text_bytes(sources, precision)
+
+
+def _text_bytes(sources: Sources, precision: Precision) -> float:
+    return BYTES[precision] * _count(sources.text_weights, ("model.layers.", "visual."))
+
+
+def _count(weights: Checkpoint, starts: tuple[str, ...] = ("",)) -> int:
+    """The numbers in the tensors whose names start so."""
+    return sum(math.prod(weights.shape(name)) for name in weights.names if name.startswith(starts))

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Final
 
 import torch
-from diffusers import QwenImageTransformer2DModel
 from safetensors.torch import save_file
 
 from dior_rt.export.qwen.graph import PRECISIONS, Precision
@@ -36,20 +35,22 @@ def peak(blocks: int, precision: Precision = "fp32") -> float:
     """Megabytes, at the peak, that writing the graphs of so many blocks adds to what a process takes."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        # Processes begun afresh: a copy of this one would start from this one's own peak.
+        make_model(folder, blocks)
+        # A process begun afresh: a copy of this one would start from this one's own peak.
         context = multiprocessing.get_context("spawn")
-        for task in (make_model, write):
-            ours, theirs = context.Pipe(duplex=False)
-            process = context.Process(target=task, args=(folder, blocks, precision, theirs))
-            process.start()
-            theirs.close()
-            found = ours.recv()
-            process.join()
+        ours, theirs = context.Pipe(duplex=False)
+        process = context.Process(target=write, args=(folder, precision, theirs))
+        process.start()
+        theirs.close()
+        found = ours.recv()
+        process.join()
     return float(found)
 
 
-def make_model(folder: Path, blocks: int, precision: Precision, result: Connection) -> None:
+def make_model(folder: Path, blocks: int) -> None:
     """Write a random transformer in shards, and a LoRA for every block."""
+    from diffusers import QwenImageTransformer2DModel  # which the process that is measured does without
+
     width = HEADS * HEAD
     model = QwenImageTransformer2DModel(
         num_layers=blocks,
@@ -63,10 +64,9 @@ def make_model(folder: Path, blocks: int, precision: Precision, result: Connecti
     down = {f"{layer}.lora_A.weight": torch.zeros(RANK, width) for layer in layers}
     up = {f"{layer}.lora_B.weight": torch.zeros(width, RANK) for layer in layers}
     save_file(down | up, folder / "lora.safetensors")
-    result.send(0.0)
 
 
-def write(folder: Path, blocks: int, precision: Precision, result: Connection) -> None:
+def write(folder: Path, precision: Precision, result: Connection) -> None:
     """Write the graphs, LoRA merged; send the growth of the process' peak."""
     config = TransformerConfig.read(folder / "model" / "config.json")
     weights = Merged(Checkpoint(folder / "model"), [Lora(folder / "lora.safetensors")])

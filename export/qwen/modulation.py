@@ -69,7 +69,7 @@ def tabulate(
 ) -> None:
     """Write the table of the sigmas' rows, running each graph as soon as it is written, then deleting it."""
     shape = (len(sigmas), 12 * config.num_layers + 2, config.width)
-    table = np.lib.format.open_memmap(path, mode="w+", dtype=np.float32, shape=shape)
+    table = np.empty(shape, np.float32)  # in memory: a mapped file on a full disk ends the process
     embedding, start = sigmas, 0
     for name, graph in written:
         engine = Engine(folder / graph.file)
@@ -81,7 +81,7 @@ def tabulate(
             start += rows.shape[1]
         for file in (folder / graph.file, (folder / graph.file).with_suffix(".data")):
             file.unlink(missing_ok=True)
-    table.flush()
+    np.save(path, table)
 
 
 def _silu(g: GraphWriter, x: str) -> str:
