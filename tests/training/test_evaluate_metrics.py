@@ -109,7 +109,7 @@ def test_borders_of_patches() -> None:
     assert border_ratio(np.ones((16, 16, 3), np.float32), 8) == 1
     blocks = ramp * 0.01 + ((rows // 8 + columns // 8) % 2)[..., None].astype(np.float32)
     assert border_ratio(blocks, 8) > 20
-    assert border_ratio(np.roll(blocks, 4, axis=(0, 1)), 8) < 0.1  # steps that are not at the borders
+    assert border_ratio(np.roll(blocks, 4, axis=(0, 1)), 8) < 0.2  # steps that are not at the borders
     noise = np.random.default_rng(4).normal(size=(128, 128, 3)).astype(np.float32)
     assert border_ratio(noise, 4) == pytest.approx(1, abs=0.03)
 

@@ -1,11 +1,10 @@
 """How well a method relights: benchmarks, baselines, measures, and the report of them.
 
-metrics     pictures, and series of figures, to numbers
-lpips       the learned distance
-benchmarks  pairs of pictures from renders, SynthBench and the public layouts
-synthbench  the renders of SynthBench
-baselines   what needs no network
-control     how a picture answers to the brush
-run         a method over a benchmark
-report      JSON, Markdown, contact sheet
+metrics, lpips        pictures, and series of figures, to numbers
+tasks, benchmarks     what a benchmark is made of; the benchmarks in a folder
+layouts               benchmarks of real photos, as others published them
+synthbench, people    the renders of SynthBench, and the figures in them
+methods, baselines    what is evaluated, and what needs no network
+control               how a picture answers to the brush
+run, report           a method over a benchmark; JSON, Markdown, contact sheet
 """
