@@ -1,15 +1,16 @@
 """Adaptive steps: as many as a picture needs to come out within a tolerance.
 
 The image x0 that the flow points at is taken to move on a line in sigma. With d(x / sigma) = x0 d(1 / sigma)
-that gives the state in closed form, at every sigma from 1 to 0; see `glide`. At the end of a step the velocity
-says where the image is in truth: how far from where it was expected is the step's error, in the picture's own
-units, and the step is corrected by it. The estimate costs no evaluation of its own (Milne's device; Hairer,
-Norsett & Wanner, Solving Ordinary Differential Equations I, III.7).
+that gives the state in closed form at every sigma from 1 down to 0; see `glide`. At the end of a step the
+velocity says where the image is in truth: how far from where it was expected is the step's error, in the
+picture's own units, and the step is corrected by it. The estimate costs no evaluation of its own (Milne's
+device; Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, III.7).
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -38,7 +39,7 @@ def sample_within(
     velocity, steps = in_float32(velocity), len(sigmas) - 1
     sigma, x, at, leap = float(sigmas[0]), noise, 0, max(1, round(FIRST * steps))
     x0 = x - sigma * velocity(x, sigma)
-    drift = np.zeros_like(x0)
+    drift: Array = np.zeros_like(x0)
     while at < steps - 1:
         leap = min(leap, steps - 1 - at)
         then = float(sigmas[at + leap])
@@ -46,12 +47,12 @@ def sample_within(
         ahead = glide(x, x0, drift, sigma, then)
         found = ahead - then * velocity(ahead, then)
         error = weight(sigma, then) * distance(found, expected)
-        share = tolerance * leap / steps / max(error, np.finfo(np.float32).tiny)
+        share = tolerance * leap / steps / max(error, sys.float_info.min)
         stretch = min(LONGER, max(SHORTER, MARGIN * math.sqrt(share)))
         if stretch < RETRY and leap > 1:
             leap = max(1, int(leap * stretch))
             continue
-        drift = (found - x0) / (then - sigma)
+        drift = (found - x0) * np.float32(1 / (then - sigma))
         x = glide(x, x0, drift, sigma, then)
         sigma, x0, at = then, found, at + leap
         leap = max(1, min(round(leap * stretch), round(LONGEST * steps)))

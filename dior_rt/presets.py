@@ -7,7 +7,7 @@ are data of the bundle, in presets.json: they were measured with its model, by `
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -53,8 +53,8 @@ class Sampling(Preset):
     """A preset together with what it leaves to the model or the caller.
 
     preset: the name it began with. guidance: the scale. tolerance: None, or the error, RMS of the final
-    picture in shares of display white, within which the steps are chosen on the way; `steps` is then
-    not used.
+    picture in shares of display white, within which steps are chosen on the way; `steps` and `solver` are
+    then not used.
     """
 
     preset: str = REFERENCE
@@ -67,6 +67,11 @@ class Sampling(Preset):
             raise ValueError(f"guidance must be a number of at least 0, not {self.guidance}")
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise ValueError(f"tolerance must lie between 0 and 1, not {self.tolerance}")
+
+    def facts(self) -> dict[str, Any]:
+        """What decides the result, for its metadata."""
+        unused = ("tolerance",) if self.tolerance is None else ("steps", "solver")
+        return {name: value for name, value in asdict(self).items() if name not in unused}
 
 
 def sampling(bundle: Bundle, preset: str | None = None, **asked: Any) -> Sampling:
@@ -82,12 +87,12 @@ def sampling(bundle: Bundle, preset: str | None = None, **asked: Any) -> Samplin
             known = ", ".join((REFERENCE, *presets))
             raise InputError(f"The model {manifest.name} has no preset {preset!r}, only: {known}.")
         began = presets[preset]
-    given = {name: value for name, value in asked.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     if "tolerance" in given and given.keys() & {"steps", "solver"}:
         raise InputError("A tolerance chooses the steps and brings its own solver; leave the other two out.")
     try:
         own = Sampling(**vars(began), preset=preset, guidance=manifest.guidance)
-        chosen = replace(own, **given, **({"solver": "adams"} if "tolerance" in given else {}))
+        chosen = replace(own, **given)
     except ValueError as error:
         raise InputError(f"{error}.") from error
     if chosen.shift is not None and not isinstance(manifest.schedule, ShiftSchedule):

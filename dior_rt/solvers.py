@@ -126,7 +126,7 @@ def _correct(x0: Array, sigma: float, past: Past) -> Array:
     """UniC: the state at sigma by a step from past[0] that also knows the image x0 there."""
     start = past[0]
     if len(past) == 1:
-        return _towards((start.x0 + x0) / 2, start, sigma)
+        return _towards(0.5 * (start.x0 + x0), start, sigma)
     # The image's values at past[1], past[0] and sigma, weighted so that lines and parabolas in lambda come
     # out right; equations 10 and 11 of the paper, h and r being infinite at sigma = 1.
     h = _log_snr(sigma) - _log_snr(start.sigma)

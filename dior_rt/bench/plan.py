@@ -5,20 +5,33 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 from dior_rt.bundle import Bundle
+from dior_rt.presets import REFERENCE, read_presets
+from dior_rt.solvers import SOLVERS
 
 STEPS = (1, 2, 4, 8, 16, 20)
 QUICK_STEPS = (1, 4, 16)
 
+#: Cheap ways to walk the flow, with so many steps where solvers are compared.
+SOLVER_STEPS = 8
+INTERVALS = ((0.3, 1.0), (0.5, 1.0), (0.8, 1.0), (0.0, 0.8))
+TOLERANCES = (0.5 / 255, 2 / 255)
+
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to relight. bundle: its folder. device, ops, threads: as for `Relighter`; None is all cores."""
+    """One way to relight. bundle: its folder. device, ops, threads: as for `Relighter`; None is all cores.
+    preset ... tolerance: as for `Relighter.relight`; what is None, or the empty interval, the preset says."""
 
     bundle: str
-    steps: int
+    preset: str
+    steps: int | None
+    solver: str | None
     guidance: float
+    interval: tuple[float, ...]
+    tolerance: float | None
     device: str
     ops: str
     threads: int | None
@@ -27,11 +40,16 @@ class Setting:
         """What differs from the reference, such as "steps 8"; by it reports are compared."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         changed = [
-            f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
+            f"{name} {_short(value)}"
             for name, value in values.items()
-            if value != getattr(reference, name)
+            if value != getattr(reference, name) and value not in (None, ())
         ]
         return ", ".join(changed) or "reference"
+
+    def how(self) -> dict[str, Any]:
+        """The arguments of `Relighter.relight`."""
+        names = ("preset", "steps", "solver", "guidance", "tolerance")
+        return {name: getattr(self, name) for name in names} | {"interval": self.interval or None}
 
 
 def reference_of(bundles: Sequence[Bundle], ops: str) -> Setting:
@@ -46,18 +64,22 @@ def sweep(
     devices: Sequence[str],
     steps: Sequence[int] = STEPS,
     threads: Sequence[int] = (),
+    ways: bool = False,
 ) -> list[Setting]:
     """The settings to compare, the reference first, none twice. A new kind of setting is one more line here.
 
-    ops: the reference's first.
+    ops: the reference's first. ways: also solvers, intervals of guidance, tolerances.
     """
     reference = reference_of(bundles, ops[0])
+    own = next(bundle for bundle in bundles if str(bundle.folder) == reference.bundle)
     return list(
         dict.fromkeys(
             [
                 reference,
                 *(replace(reference, steps=count) for count in steps),
                 replace(reference, guidance=1.0),  # one branch of the network instead of two
+                *(_ways(reference, own) if ways else ()),
+                *(replace(reference, preset=name, steps=None, solver=None) for name in read_presets(own)),
                 *(replace(reference, threads=count) for count in threads),
                 *(replace(reference, ops=name) for name in ops),
                 *(replace(reference, device=name) for name in devices),
@@ -88,6 +110,38 @@ def interleave(settings: Sequence[Setting], repeats: int) -> list[Setting]:
     return [setting for _ in range(repeats) for setting in settings]
 
 
+def _ways(reference: Setting, bundle: Bundle) -> list[Setting]:
+    """Solvers at the same small number of steps, guidance in intervals, and, on a light grid, tolerances."""
+    few = min(SOLVER_STEPS, bundle.manifest.steps)
+    return [
+        *(replace(reference, steps=few, solver=name) for name in SOLVERS),
+        *(replace(reference, interval=interval) for interval in INTERVALS),
+        *(
+            replace(reference, steps=None, solver=None, tolerance=tolerance)
+            for tolerance in TOLERANCES
+            if bundle.manifest.grid
+        ),
+    ]
+
+
 def _own(bundle: Bundle, ops: str) -> Setting:
     manifest = bundle.manifest
-    return Setting(str(bundle.folder), manifest.steps, manifest.guidance, "cpu", ops, None)
+    return Setting(
+        bundle=str(bundle.folder),
+        preset=REFERENCE,
+        steps=manifest.steps,
+        solver="euler",
+        guidance=manifest.guidance,
+        interval=(),
+        tolerance=None,
+        device="cpu",
+        ops=ops,
+        threads=None,
+    )
+
+
+def _short(value: object) -> str:
+    """A number as it reads best; an interval by its ends."""
+    if isinstance(value, tuple):
+        return " to ".join(map(_short, value))
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

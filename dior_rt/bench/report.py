@@ -22,7 +22,7 @@ from dior_rt.files import check_readable, reason, replacing
 from dior_rt.pictures import Photo
 from dior_rt.records import parse, read_json, unparse
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 MOST_BYTES = 16 << 20
 
 
@@ -52,8 +52,8 @@ class PhotoFacts:
 class Result:
     """What one setting takes and costs.
 
-    ratio: the reference's total seconds by this one's. seconds, start_up, start_up_cold, peak_bytes: see
-    `Measured`. step_flops: of one step, the mean over the photos. gemm_share: what a step reaches of the
+    ratio: the reference's total seconds by this one's. seconds, steps, start_up, start_up_cold, peak_bytes:
+    see `Measured`. step_flops: of one step, the mean over the photos. gemm_share: what a step reaches of the
     machine's GEMM rate; only where the CPU's cores all take part. copy_share: what the kernels reach of the
     copy bandwidth of the memory that they work in, see `copy_share`. None: not known.
     """
@@ -62,6 +62,7 @@ class Result:
     setting: Setting
     ratio: float
     seconds: dict[str, float]
+    steps: float
     per_step: float
     images_a_minute: float
     start_up: float
@@ -77,7 +78,7 @@ class Result:
 class Report:
     """One benchmark. results: the reference first. failed: setting -> why it could not be run."""
 
-    format: Literal[1] = FORMAT
+    format: Literal[2] = FORMAT
     machine: Machine
     bundles: tuple[BundleFacts, ...]
     photos: tuple[PhotoFacts, ...]
@@ -152,9 +153,11 @@ def _result(
 ) -> Result:
     reference = next(iter(outcome.measured))
     seconds = measured.seconds
-    per_step = seconds["steps"] / setting.steps
+    per_step = seconds["steps"] / measured.steps
     bundle = next(b for b in bundles if str(b.folder) == setting.bundle)
-    counts = [step_flops(bundle, photo.size, setting.guidance) for photo in photos]
+    # Elsewhere one step may ask the network twice, or run a branch less than another.
+    alike = setting.solver == "euler" and not setting.interval
+    counts = [step_flops(bundle, photo.size, setting.guidance) if alike else None for photo in photos]
     flops = fmean(count for count in counts if count) if all(counts) else None
     whole_cpu = setting.device == "cpu" and setting.threads is None
     return Result(
@@ -162,6 +165,7 @@ def _result(
         setting=setting,
         ratio=outcome.measured[reference].seconds["total"] / seconds["total"],
         seconds=seconds,
+        steps=measured.steps,
         per_step=per_step,
         images_a_minute=60 / seconds["total"],
         start_up=measured.start_up,

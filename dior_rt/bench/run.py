@@ -20,6 +20,7 @@ from dior_rt.bench.worker import STAGES, Job, Pair, Sample
 from dior_rt.errors import DeviceError, DiorError
 from dior_rt.files import reason
 from dior_rt.pictures import read_photo
+from dior_rt.presets import REFERENCE
 from dior_rt.records import parse, unparse
 
 Advance = Callable[[str], None]  # called before every run, with what runs
@@ -32,11 +33,13 @@ CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
 class Measured:
     """A setting's medians over the repeats, and the worst photo's difference from the reference.
 
-    seconds: of one photo, by stage, and their sum as "total". start_up_cold: with no compiled kernel there
-    yet; start_up: with all of them. peak_bytes: of memory, the median of the repeats.
+    seconds: of one photo, by stage, and their sum as "total". steps: as many as were taken. start_up_cold:
+    with no compiled kernel there yet; start_up: with all of them. peak_bytes: of memory, the median of the
+    repeats.
     """
 
     seconds: dict[str, float]
+    steps: float
     start_up: float
     start_up_cold: float
     peak_bytes: int | None
@@ -141,7 +144,16 @@ def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Samp
 
 def _host(setting: Setting) -> Setting:
     """What a start-up depends on: the setting with all else as small as can be."""
-    return replace(setting, steps=1, guidance=1.0, threads=None)
+    return replace(
+        setting,
+        preset=REFERENCE,
+        steps=1,
+        solver="euler",
+        guidance=1.0,
+        interval=(),
+        tolerance=None,
+        threads=None,
+    )
 
 
 def _differences(
@@ -163,6 +175,7 @@ def _summary(samples: Sequence[Sample], cold: Sample, difference: Difference) ->
     peaks = [sample.peak_bytes for sample in samples if sample.peak_bytes is not None]
     return Measured(
         seconds,
+        samples[0].steps,
         median(sample.start_up for sample in samples),
         cold.start_up,
         int(median(peaks)) if peaks else None,

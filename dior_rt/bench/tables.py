@@ -30,6 +30,7 @@ def as_markdown(report: Report) -> str:
         [
             result.name,
             *(f"{result.seconds[stage]:.3f}" for stage in ("read", "kernels")),
+            f"{result.steps:g}",
             f"{result.per_step:.4f}",
             *(f"{result.seconds[stage]:.3f}" for stage in ("transfer", "write")),
             f"{result.start_up_cold:.2f}",
@@ -40,10 +41,10 @@ def as_markdown(report: Report) -> str:
         for result in report.results
     ]
     where = [
-        "seconds", "read", "kernels", "a step", "transfer", "write", "start-up cold", "warm", "of GEMM",
-        "of copy",
+        "seconds", "read", "kernels", "steps", "a step", "transfer", "write", "start-up cold", "warm",
+        "of GEMM", "of copy",
     ]  # fmt: skip
-    return "\n\n".join([_table(heads, speed), _table(where, stages), "\n".join(_facts(report))])
+    return "\n\n".join([table(heads, speed), table(where, stages), "\n".join(_facts(report))])
 
 
 def compare(new: Report, old: Report) -> str:
@@ -63,7 +64,7 @@ def compare(new: Report, old: Report) -> str:
     ]
     heads = ["new / old", "seconds", "a step", "start-up", "peak memory", "PSNR, dB"]
     notes = [f"- not the same in both: {', '.join(changed)}" for changed in [_changed(new, old)] if changed]
-    return "\n\n".join([_table(heads, rows) if rows else "No setting is in both benchmarks.", *notes])
+    return "\n\n".join([table(heads, rows) if rows else "No setting is in both benchmarks.", *notes])
 
 
 def _facts(report: Report) -> list[str]:
@@ -108,7 +109,8 @@ def _ratio(new: float | None, old: float | None) -> str:
     return f"{new / old:.3f}" if new and old else "?"
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Markdown, its columns aligned."""
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = [heads, ["-" * width for width in widths], *rows]
     return "\n".join(

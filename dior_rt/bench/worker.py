@@ -41,11 +41,13 @@ class Sample:
     """What one run took.
 
     seconds: for one photo, the mean over the photos, by stage: read, kernels, steps, transfer, write.
+    steps: as many as were taken, the mean over the photos.
     start_up: from the start of the process to the end of the first step, loading included.
     peak_bytes: the most memory that the process held at once; None where the system does not say.
     """
 
     seconds: dict[str, float]
+    steps: float
     start_up: float
     peak_bytes: int | None
 
@@ -59,7 +61,7 @@ def work(job: Job) -> Sample:
 
     from dior_rt.relight import Relighter
 
-    setting, sums, started = job.setting, dict.fromkeys(STAGES, 0.0), []
+    setting, sums, taken, started = job.setting, dict.fromkeys(STAGES, 0.0), 0, []
     relighter = Relighter(setting.bundle, setting.device, setting.ops, setting.threads)
 
     def first_step(step: int, steps: int) -> None:
@@ -74,7 +76,8 @@ def work(job: Job) -> Sample:
         strokes = read_strokes(Path(pair.strokes), photo.size)
         watch.lap("read")
         relighter.relight(photo.pixels, strokes, steps=1, guidance=setting.guidance, progress=first_step)
-        relit = relighter.relight(photo.pixels, strokes, steps=setting.steps, guidance=setting.guidance)
+        relit = relighter.relight(photo.pixels, strokes, **setting.how())
+        taken += relit.steps
         if relit.notice:
             raise InputError(f"{pair.strokes} cannot be measured with: {relit.notice}")
         watch.lap("relight")
@@ -83,7 +86,7 @@ def work(job: Job) -> Sample:
         for stage in STAGES:
             sums[stage] += (watch.seconds | relit.seconds)[stage]
     means = {stage: total / len(job.pairs) for stage, total in sums.items()}
-    return Sample(means, started[0], peak_memory())
+    return Sample(means, taken / len(job.pairs), started[0], peak_memory())
 
 
 def peak_memory() -> int | None:

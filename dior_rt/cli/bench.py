@@ -58,7 +58,7 @@ def bench(
     ] = None,
     debug: options.Debug = False,
 ) -> None:
-    """Measure speed and, against the reference run, error: of every number of steps, device and kernel here.
+    """Measure speed and, against the reference run, error: of steps, solvers, presets, devices and kernels.
 
     The reference takes all of the model's steps, on the CPU. Every run is a process of its own; settings take
     turns, and medians are printed, as a table in Markdown.
@@ -95,6 +95,7 @@ def bench(
         device or available(),
         steps or (QUICK_STEPS if quick else STEPS),
         () if quick else thread_counts(usable_cores()),
+        ways=not quick,
     )
     with ExitStack() as stack:
         pairs = _pairs(files or [], stack, megapixels)

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -105,7 +104,7 @@ def relight(
         )
     watch.lap("relight")
     settings = _settings(relighter) | {
-        **asdict(relit.sampling),
+        **relit.sampling.facts(),
         "steps": relit.steps,
         "seed": relit.seed,
         "intensity": relit.intensity,

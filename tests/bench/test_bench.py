@@ -28,7 +28,7 @@ from dior_rt.strokes import read_strokes
 from dior_rt.training.network import load_network
 
 CHECKPOINT = Path(__file__).parents[2] / "training" / "checkpoints" / "mini" / "model.safetensors"
-SETTING = Setting("mini", 40, 2.0, "cpu", "numpy", None)
+SETTING = Setting("mini", "reference", 40, "euler", 2.0, (), None, "cpu", "numpy", None)
 
 
 def picture(seed: int, dtype: type = np.uint8) -> np.ndarray:
@@ -42,6 +42,21 @@ def picture(seed: int, dtype: type = np.uint8) -> np.ndarray:
 def test_a_setting_is_named_after_what_it_changes() -> None:
     assert SETTING.name(SETTING) == "reference"
     assert replace(SETTING, steps=8, guidance=1.0).name(SETTING) == "steps 8, guidance 1"
+    assert replace(SETTING, interval=(0.3, 1.0)).name(SETTING) == "interval 0.3 to 1"
+    assert replace(SETTING, preset="fast", steps=None, solver=None).name(SETTING) == "preset fast"
+
+
+def test_a_preset_decides_what_its_setting_leaves_open() -> None:
+    preset = replace(SETTING, preset="fast", steps=None, solver=None)
+    assert preset.how() == {
+        "preset": "fast",
+        "steps": None,
+        "solver": None,
+        "guidance": 2.0,
+        "tolerance": None,
+        "interval": None,
+    }
+    assert replace(SETTING, interval=(0.3, 1.0)).how()["interval"] == (0.3, 1.0)
 
 
 def test_the_sweep_changes_one_thing_at_a_time_and_nothing_twice(mini_bundle: Path) -> None:

@@ -36,7 +36,7 @@ class Counted:
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_solver_converges_with_its_order(name):
-    """Within sigmas where lambda is finite: from 0.9, on the flow, to 0.1. UniPC's corrector wins an order."""
+    """From 0.9, on the flow, to 0.1, where lambda is finite. UniPC's corrector wins an order."""
     noise, steps = draw_noise(5, (64,)), np.array([40, 80, 160])
 
     def on_the_flow(sigma):

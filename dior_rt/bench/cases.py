@@ -1,0 +1,79 @@
+"""Photos and light drawn on them, by the dozen: from held-out renders, or made by arithmetic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from dior_rt.errors import InputError
+from dior_rt.kernels import NumpyOps, Stroke, Strokes
+
+SIZES = ((160, 240), (200, 200), (240, 160))
+OPS = NumpyOps()
+
+
+@dataclass(frozen=True)
+class Case:
+    """photo: (H, W, 3) uint8, sRGB. strokes: of its size. seed: of the noise."""
+
+    photo: NDArray[np.uint8]
+    strokes: Strokes
+    seed: int
+
+
+def made_up(count: int) -> list[Case]:
+    """Balls before a textured wall under one light, and strokes of any colour and strength."""
+    return [_made_up(np.random.default_rng([number, 71]), number) for number in range(count)]
+
+
+def from_renders(folder: Path, count: int) -> list[Case]:
+    """Pairs mixed from a folder of renders; half replace all lights, half change one, and of each half the
+    light is given whole or as strokes. Needs dior-rt[train]. Raises InputError for too few renders."""
+    from dior_rt.training.triplets import interest, load_views, pair
+
+    views = load_views(folder)
+    if len(views) < count:
+        raise InputError(f"{folder} has {len(views)} views, fewer than {count}.")
+    cases = []
+    for number, view in enumerate(views[:count]):
+        sample = pair(np.random.default_rng([number, 72]), view, ("replace", "change")[number % 2])
+        if number // 2 % 2:
+            drawn = Strokes(sample.target, np.ones(sample.target.shape[:2], np.float32))
+        else:
+            where = interest(sample) if sample.kind == "change" else None
+            drawn = OPS.sparsify(sample.target, "strokes", number, interest=where)
+        cases.append(Case(OPS.encode_srgb(sample.photo, np.uint8), drawn, number))
+    return cases
+
+
+def _made_up(rng: Generator, seed: int) -> Case:
+    height, width = SIZES[rng.integers(len(SIZES))]
+    y, x = np.mgrid[:height, :width].astype(np.float32) / max(height, width)
+    slant, waves = rng.uniform(-0.5, 0.5, 2), rng.uniform(20, 300, 4)
+    texture = 0.1 * np.sin(waves[0] * x + waves[1] * y) * np.sin(waves[2] * y - waves[3] * x)
+    wall = (rng.uniform(0.3, 0.8) + slant[0] * x + slant[1] * y + texture)[..., None]
+    linear = wall * rng.uniform(0.2, 0.9, 3)
+    light = rng.normal(size=3) * (1, 1, 0.3) + (0, 0, 0.8)
+    for _ in range(rng.integers(1, 6)):
+        across, down = ((axis - rng.uniform(0.1, 0.9)) / rng.uniform(0.08, 0.3) for axis in (x, y))
+        depth = np.sqrt(np.clip(1 - across**2 - down**2, 0, None))
+        shade = (np.stack([across, down, depth], axis=-1) @ (light / np.linalg.norm(light))).clip(0)
+        ball = (0.05 + shade[..., None]) * rng.uniform(0.1, 0.9, 3)
+        linear = np.where((depth > 0)[..., None], ball, linear)
+    photo = OPS.encode_srgb(linear.clip(0, 1).astype(np.float32), np.uint8)
+    strokes = [_stroke(rng, height, width) for _ in range(rng.integers(1, 5))]
+    return Case(photo, OPS.draw_strokes(strokes, (height, width)), seed)
+
+
+def _stroke(rng: Generator, height: int, width: int) -> Stroke:
+    points = rng.uniform(0.05, 0.95, (rng.integers(1, 4), 2)) * (width, height)
+    return Stroke(
+        points=tuple((float(x), float(y)) for x, y in points),
+        width=float(rng.uniform(0.04, 0.15) * width),
+        color=tuple(rng.uniform(0.1, 1, 3).tolist()),
+        intensity=float(2 ** rng.uniform(-2, 1.5)),
+    )
