@@ -4,7 +4,7 @@ The coverage of a pixel whose centre is at distance d from a stroke's centre lin
 / 2,
 
     t = clip((r + 1/2 - d) / (1 + softness * r), 0, 1)
-    coverage = min(width, 1) * (t + softness * (t^2 (3 - 2 t) - t))
+    coverage = clip(width, 2^-60, 1) * (t + softness * (t^2 (3 - 2 t) - t))
 
 A hard edge is a ramp one pixel wide; a soft one falls smoothly from the centre line's neighbourhood to the
 border. A stroke thinner than a pixel is drawn a pixel wide and as much fainter. Strokes lie over one
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from dior_rt.kernels.resample import FAINTEST
 from dior_rt.kernels.types import FloatArray, Stroke
 
 #: Side of the square tiles for which segments are listed.
@@ -29,17 +30,35 @@ SEGMENT = np.dtype("(4,)f4, f4, f4, f4, i4")
 SEGMENT.names = ("ends", "radius", "softness", "strength", "stroke")
 
 
-def segments(stroke: Stroke) -> FloatArray:
-    """(n, 4) float32: the ends x0, y0, x1, y1 of the stroke's n >= 1 segments; a dot is one of length 0."""
-    points = np.asarray(stroke.points, np.float32)
+def segments(stroke: Stroke, size: tuple[int, int]) -> FloatArray:
+    """(n, 4) float32: the ends x0, y0, x1, y1 of the stroke's segments; a dot is one of length 0.
+
+    What lies too far from a picture of (H, W) pixels to touch it is cut away (Liang & Barsky, 1984), so that
+    an end anywhere leaves float32 its accuracy.
+    """
+    points = np.asarray(stroke.points, np.float64)
     if len(points) == 1:
         points = np.repeat(points, 2, 0)
-    return np.concatenate([points[:-1], points[1:]], 1)
+    start, way = points[:-1], np.diff(points, axis=0)
+    low, high = -radius(stroke) - 1, np.array(size[::-1]) + radius(stroke) + 1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Along each axis, the shares of the way at which it comes in and goes out.
+        edges = np.sort(np.stack([(low - start) / way, (high - start) / way]), axis=0)
+    inside = (start >= low) & (start <= high)
+    edges = np.where(way == 0, np.where(inside, [[[0.0]], [[1.0]]], [[[1.0]], [[0.0]]]), edges)
+    first, last = np.maximum(edges[0].max(1), 0)[:, None], np.minimum(edges[1].min(1), 1)[:, None]
+    ends = np.where(last == 1, start + way, start + last * way)
+    return np.concatenate([start + first * way, ends], 1)[(first <= last)[:, 0]].astype(np.float32)
 
 
 def radius(stroke: Stroke) -> float:
     """Half the width that is drawn: at least half a pixel."""
     return max(stroke.width, 1.0) / 2
+
+
+def strength(stroke: Stroke) -> float:
+    """The coverage in the middle: less than 1 for what is thinner than a pixel."""
+    return min(max(stroke.width, FAINTEST), 1.0)
 
 
 def distance_squared(segment: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -57,7 +76,7 @@ def coverage(stroke: Stroke, distance: FloatArray) -> FloatArray:
     r, soft = radius(stroke), stroke.softness
     t = np.clip((r + 0.5 - distance) / (1 + soft * r), 0, 1).astype(np.float32)
     smooth = t * t * (3 - 2 * t)
-    return np.float32(min(stroke.width, 1.0)) * (t + np.float32(soft) * (smooth - t))
+    return np.float32(strength(stroke)) * (t + np.float32(soft) * (smooth - t))
 
 
 @dataclass(frozen=True)
@@ -78,20 +97,20 @@ def plan(strokes: Sequence[Stroke], size: tuple[int, int]) -> Plan:
     rows, columns = (-(-side // TILE) for side in size)
     parts, tiles = [], []
     for number, stroke in enumerate(strokes):
-        ends = segments(stroke)
+        ends = segments(stroke, size)
         record = np.empty(len(ends), SEGMENT)
         record["ends"], record["radius"], record["softness"] = ends, radius(stroke), stroke.softness
-        record["strength"], record["stroke"] = min(stroke.width, 1.0), number
+        record["strength"], record["stroke"] = strength(stroke), number
         parts.append(record)
         tiles += [_tiles(segment, radius(stroke) + 1, rows, columns) for segment in ends]
     segment = np.repeat(np.arange(len(tiles)), [len(touched) for touched in tiles])
-    tile = np.concatenate(tiles)
+    tile = np.concatenate([np.empty(0, np.int64), *tiles])
     order = np.argsort(tile, kind="stable")
+    # One segment and one entry more than there are, for no buffer may be empty.
     return Plan(
-        np.concatenate(parts),
+        np.concatenate([*parts, np.zeros(1, SEGMENT)]),
         np.array([[*stroke.light, 1.0] for stroke in strokes], np.float32),
         np.searchsorted(tile[order], np.arange(rows * columns + 1)).astype(np.int32),
-        # One more than there are, for no buffer may be empty.
         np.append(segment[order], 0).astype(np.int32),
     )
 

@@ -63,7 +63,7 @@ class NumpyOps(Ops):
         light, mask = np.zeros((height, width, 3), np.float32), np.zeros(size, np.float32)
         for rows in bands(height, width, BAND):
             for stroke in strokes:
-                _lay_over(light[rows], mask[rows], stroke, rows.start)
+                _lay_over(light[rows], mask[rows], stroke, rows.start, size)
         np.divide(light, mask[..., None], out=light, where=mask[..., None] > 0)
         return Strokes(light, mask)
 
@@ -120,9 +120,11 @@ def _weighted(light: Picture, mask: Picture) -> FloatArray:
     return np.concatenate([np.where(weight > 0, linear, np.float32(0)) * weight, weight], 2)
 
 
-def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int) -> None:
-    """Blend one stroke over a band that starts at row `top`; light holds value * mask."""
-    ends, margin = draw.segments(stroke), draw.radius(stroke) + 1
+def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int, size: Grid) -> None:
+    """Blend one stroke over a picture's band that starts at row `top`; light holds value * mask."""
+    ends, margin = draw.segments(stroke, size), draw.radius(stroke) + 1
+    if len(ends) == 0:
+        return
     box = _window(ends.reshape(-1, 2), margin, top, mask.shape)
     nearest = np.full(mask[box].shape, np.inf, np.float32)
     if nearest.size == 0:

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+#: Pixels: farther points and wider strokes are refused.
+FARTHEST = 1e9
+
 FloatArray = npt.NDArray[np.float32]
 Picture = npt.NDArray[Any]  # uint8, uint16 or float32
 
@@ -36,10 +39,10 @@ class Stroke:
     def __post_init__(self) -> None:
         if not self.points or any(len(point) != 2 for point in self.points):
             raise ValueError("a stroke needs at least one point, each an (x, y) pair")
-        if not all(math.isfinite(value) for point in self.points for value in point):
-            raise ValueError("a stroke's points must be finite")
-        if not (math.isfinite(self.width) and self.width > 0):
-            raise ValueError(f"a stroke's width must be a positive number of pixels, not {self.width}")
+        if not all(abs(value) <= FARTHEST for point in self.points for value in point):
+            raise ValueError(f"a stroke's points must lie within {FARTHEST:g} pixels of the corner")
+        if not 0 < self.width <= FARTHEST:
+            raise ValueError(f"a stroke's width must lie between 0 and {FARTHEST:g} pixels, not {self.width}")
         if len(self.color) != 3 or not all(math.isfinite(c) and c >= 0 for c in self.light):
             raise ValueError("a stroke's color must be three finite numbers >= 0, and its intensity one")
         if not 0 <= self.softness <= 1:

@@ -128,6 +128,35 @@ def test_a_window_of_the_picture_shows_the_same_strokes(ops):
     np.testing.assert_allclose(part.light, whole.light[20:50, 15:55], atol=1e-5)
 
 
+@pytest.mark.parametrize("softness", [0.0, 1.0])
+@pytest.mark.parametrize(
+    ("far", "near"),
+    [
+        (((-1e9, 10.25), (1e9, 10.25)), ((-100.0, 10.25), (200.0, 10.25))),
+        (((20.5, 5.0), (20.5, 1e9)), ((20.5, 5.0), (20.5, 100.0))),
+        (((-1e8 + 7, -1e8), (1e8 + 7, 1e8)), ((-93.0, -100.0), (107.0, 100.0))),
+        (((30.0, 30.0), (1e9, 1e9), (1e9, -1e9)), ((30.0, 30.0), (130.0, 130.0))),
+    ],
+)
+def test_ends_far_outside_leave_a_line_its_accuracy(ops, far, near, softness):
+    """Squares of such distances are none that float32 can hold, or tell apart."""
+    drawn = ops.draw_strokes([Stroke(far, 6.0, softness=softness)], (40, 50))
+    np.testing.assert_allclose(
+        drawn.mask, coverage(Stroke(near, 6.0, softness=softness), (40, 50)), atol=2e-5
+    )
+
+
+def test_a_stroke_as_thin_as_can_be_keeps_its_value(ops):
+    drawn = ops.draw_strokes([Stroke(((3.0, 9.0), (40.0, 20.0)), 1e-42, (0.5, 1.0, 2.0))], (32, 48))
+    assert 0 < drawn.mask.max() < 1e-18
+    np.testing.assert_allclose(drawn.light[drawn.mask > 0].max(0), (0.5, 1, 2), rtol=1e-5)
+
+
+def test_a_stroke_wider_than_any_picture_is_everywhere(ops):
+    drawn = ops.draw_strokes([Stroke(((5.0, 5.0),), 1e9, softness=0.5)], (32, 48))
+    np.testing.assert_allclose(drawn.mask, 1, atol=1e-6)
+
+
 def test_strokes_outside_draw_nothing(ops):
     drawn = ops.draw_strokes([Stroke(((-50.0, -9.0), (900.0, -9.0)), 4.0)], (33, 65))
     assert not drawn.mask.any() and not drawn.light.any()
@@ -157,9 +186,11 @@ def test_bands_leave_no_seam(ops, monkeypatch):
     [
         {"points": ()},
         {"points": ((1.0, math.nan),)},
+        {"points": ((1.0, 2e9),)},
         {"points": ((1.0,),)},
         {"width": 0.0},
         {"width": math.inf},
+        {"width": 2e9},
         {"color": (1.0, 1.0)},
         {"color": (1.0, -1.0, 1.0)},
         {"intensity": -1.0},

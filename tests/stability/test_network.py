@@ -39,6 +39,7 @@ HOSTILE: dict[str, Callable[[Feeds], Feeds]] = {
     },
     "clipped white photo": lambda f: {**f, "photo": ONES(f["photo"])},
     "all tokens equal": lambda f: {**f, **{name: ZEROS(f[name]) for name in ("x", "photo", "light", "mask")}},
+    "velocity at fp16's edge": lambda f: {**f, "x": 60 * np.sign(f["x"])},  # at sigma 0.001
     "state at fp16's edge": lambda f: {**f, "x": HALF * np.sign(f["x"])},
     "state subnormal": lambda f: {**f, "x": 1e-40 * f["x"]},
 }
@@ -51,6 +52,8 @@ def test_velocity(bundle, network, usual_feeds, hold, case):
     want = network.run(feeds)["velocity"]
     scale = np.maximum(np.abs(want).max((1, 2, 3), keepdims=True), 1)
     for precision, bound in VELOCITY.items():
+        if precision == "fp16" and np.abs(want).max() > HALF:
+            continue  # the answer itself is none that float16 can hold
         got = Engine(bundle(precision).path("velocity"), threads=1).run(feeds)["velocity"]
         hold(f"mini: {case}", precision, got, want, bound, "largest value", scale)
 
