@@ -5,7 +5,8 @@ Its heads are physical. To relight it predicts a log-ratio r of light a cell and
     relit = (photo + e) exp(r) - e        in linear light, e = 0.02
 
 so a network that has learnt nothing returns the photo, and black can still be lit. To estimate it predicts
-the encoded Lumi map as a change of the encoded photo. Both become x0; the velocity is v = (x - x0) / sigma.
+the encoded Lumi map as a change of the encoded photo. Both are what x0 is expected to be; the velocity is
+that of a narrow Gaussian about it.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
 BOUNCED = 0.05  # b: light that reaches a place where no source shines, so that drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
-SMALLEST_SIGMA = 1e-3
+SPREAD = 0.5  # of x0 about what the network expects: some 0.12 in sRGB
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,15 @@ def encode_light(light: Tensor) -> Tensor:
 
 def decode_light(encoded: Tensor) -> Tensor:
     return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
+
+
+def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
+    """E[eps - x0 | x] where x = (1 - sigma) x0 + sigma eps and x0 is Gaussian about `expected` with std SPREAD.
+
+    So the answer rests on `expected` near noise and on the state near the image, and no sigma is divided by.
+    """
+    variance = SPREAD**2
+    return ((sigma - (1 - sigma) * variance) * x - sigma * expected) / ((1 - sigma) ** 2 * variance + sigma**2)
 
 
 class Features(NamedTuple):
@@ -167,8 +177,8 @@ class Mini(nn.Module):
         # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
         ratio = raw + mask * (aim - torch.log(decode_light(own.clamp(max=BRIGHTEST)) + BOUNCED))
         relit = _relight(photo, linear, ratio)
-        x0 = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
-        return (x - x0) / sigma.clamp_min(SMALLEST_SIGMA)[:, None, None, None]
+        expected = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
+        return velocity(x, sigma[:, None, None, None], expected)
 
     def _transform(self, tokens: Tensor, condition: Tensor) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells."""

@@ -26,7 +26,10 @@ from dior_rt.training.network import (
 SMALL = Config(width=32, depth=1, heads=2, patch=4, fine=4, half=8, quarter=16)
 
 
-def inputs(rows: int = 8, columns: int = 12, batch: int = 3, seed: int = 0) -> dict[str, torch.Tensor]:
+def inputs(
+    rows: int = 8, columns: int = 12, batch: int = 3, seed: int = 0, noise: bool = False
+) -> dict[str, torch.Tensor]:
+    """noise: whether x is nothing else, so that the answer is all the network's."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(channels: int) -> torch.Tensor:
@@ -34,7 +37,7 @@ def inputs(rows: int = 8, columns: int = 12, batch: int = 3, seed: int = 0) -> d
 
     return {
         "x": torch.randn(batch, 3, rows, columns, generator=generator),
-        "sigma": torch.tensor([1.0, 0.5, 0.01])[:batch],
+        "sigma": torch.ones(batch) if noise else torch.tensor([1.0, 0.5, 0.01])[:batch],
         "photo": uniform(3),
         "light": 4 * uniform(3),
         "mask": uniform(1).round(),
@@ -60,7 +63,7 @@ def awake() -> Mini:
 
 @torch.no_grad()
 def test_untrained_it_keeps_the_photo_where_nothing_is_drawn_and_takes_the_photo_for_light() -> None:
-    network, given = Mini(SMALL), inputs()
+    network, given = Mini(SMALL), inputs(noise=True)
     silent = (given["mask"] == 0).expand(-1, 3, -1, -1)
     np.testing.assert_allclose(found(network, given)[silent], 0, atol=1e-5)
     given["mode"] += 1
@@ -70,7 +73,7 @@ def test_untrained_it_keeps_the_photo_where_nothing_is_drawn_and_takes_the_photo
 
 @torch.no_grad()
 def test_untrained_it_already_follows_the_drawn_light() -> None:
-    network, given = Mini(SMALL), inputs()
+    network, given = Mini(SMALL), inputs(noise=True)
     given["photo"], given["mask"] = 0.3 + 0 * given["photo"], 1 + 0 * given["mask"]
     given["light"] = 0.02 + 0.03 * given["light"]
     light = [given["light"], 2 * given["light"]]
@@ -78,6 +81,16 @@ def test_untrained_it_already_follows_the_drawn_light() -> None:
     lit = [torch.log(one + module.FLOOR) for one in relit]
     ratio = torch.log((light[1] + module.BOUNCED) / (light[0] + module.BOUNCED))
     torch.testing.assert_close(lit[1] - lit[0], ratio, atol=0.02, rtol=0.02)
+
+
+def test_what_the_network_leaves_open_is_a_gaussian_about_what_it_expects() -> None:
+    expected, noise = torch.randn(2, 1, 500, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    sigmas = torch.linspace(1, 0, 4001, dtype=torch.float64)
+    x = noise
+    for sigma, then in zip(sigmas[:-1], sigmas[1:], strict=True):
+        x = x + (then - sigma) * module.velocity(x, sigma, expected)
+    torch.testing.assert_close(x, expected + module.SPREAD * noise, atol=2e-3, rtol=0)
+    assert module.velocity(noise, sigmas[-1], expected).isfinite().all(), "also where there is no noise left"
 
 
 @torch.no_grad()
@@ -132,7 +145,7 @@ def test_positions_enter_attention_by_their_distance_alone() -> None:
 
 
 def test_relit_light_stays_physical(awake) -> None:
-    given = inputs()
+    given = inputs(noise=True)
     with torch.no_grad():
         awake.head.bias[:3] = 50.0
         bright = given["photo"] + found(awake, given) / 4
