@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,20 +15,25 @@ from dior_rt.kernels import NumpyOps
 ROWS = 256  # compared at a time, so that a large picture needs no second one in float64
 
 
+Distance = Callable[[NDArray[np.uint8], NDArray[np.uint8]], float]  # of two pictures, to the eye
+
+
 @dataclass(frozen=True)
 class Difference:
     """Of a picture from the reference.
 
     psnr: dB over the sRGB-encoded samples, peak 1; None where the pictures are identical. largest: of any
     sample, in 1/255. light: sum |L - L_ref| / sum L_ref over the linear light L of the cells of a grid.
+    lpips: the perceptual distance, where it was asked for.
     """
 
     psnr: float | None
     largest: float
     light: float
+    lpips: float | None = None
 
 
-def compare_pictures(picture: NDArray, reference: NDArray) -> Difference:
+def compare_pictures(picture: NDArray, reference: NDArray, lpips: Distance | None = None) -> Difference:
     """Compare two pictures (H, W, 3) of one integer dtype, sRGB-encoded. Raises ValueError for other ones."""
     if picture.shape != reference.shape or picture.dtype != reference.dtype:
         raise ValueError(
@@ -42,7 +47,8 @@ def compare_pictures(picture: NDArray, reference: NDArray) -> Difference:
         squares += float(np.sum(error * error))
         largest = max(largest, float(np.abs(error).max()))
     psnr = -10 * math.log10(squares / reference.size) if squares else None
-    return Difference(psnr, 255 * largest, _light_error(picture, reference))
+    seen = lpips(_eight_bits(picture), _eight_bits(reference)) if lpips else None
+    return Difference(psnr, 255 * largest, _light_error(picture, reference), seen)
 
 
 def worst(differences: Sequence[Difference]) -> Difference:
@@ -51,7 +57,12 @@ def worst(differences: Sequence[Difference]) -> Difference:
         min((d.psnr for d in differences if d.psnr is not None), default=None),
         max(d.largest for d in differences),
         max(d.light for d in differences),
+        max((d.lpips for d in differences if d.lpips is not None), default=None),
     )
+
+
+def _eight_bits(picture: NDArray) -> NDArray[np.uint8]:
+    return picture if picture.dtype == np.uint8 else np.rint(picture / 257).astype(np.uint8)
 
 
 def _light_error(picture: NDArray, reference: NDArray) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 
-from dior_rt.bench.difference import Difference, compare_pictures, worst
+from dior_rt.bench.difference import Difference, Distance, compare_pictures, worst
 from dior_rt.bench.machine import Rooflines, measure_rooflines, medians
 from dior_rt.bench.plan import Setting, interleave
 from dior_rt.bench.worker import STAGES, Job, Pair, Sample
@@ -67,11 +67,12 @@ def measure(
     advance: Advance,
     *,
     strict: bool = False,
+    lpips: Distance | None = None,
 ) -> Outcome:
     """Measure the settings, of which the first is the reference, and the machine's rooflines.
 
-    strict: raise DeviceError where any setting fails, not only where the reference does. All are tried
-    before the first is timed.
+    lpips: measures what the eye sees, as well. strict: raise DeviceError where any setting fails, not only
+    where the reference does. All are tried before the first is timed.
     """
     reference = settings[0]
     with tempfile.TemporaryDirectory(prefix="dior-bench-") as scratch:
@@ -111,7 +112,7 @@ def measure(
             advance(setting.name(reference))
             samples[setting] += attempt(setting, setting, pairs)
         running = [setting for setting in settings if setting not in failed]
-        differences = _differences(running, folders, len(pairs))
+        differences = _differences(running, folders, len(pairs), lpips)
     measured = {
         setting: _summary(samples[setting], cold[_host(setting)], differences[setting]) for setting in running
     }
@@ -157,14 +158,14 @@ def _host(setting: Setting) -> Setting:
 
 
 def _differences(
-    settings: Sequence[Setting], folders: dict[Setting, Path], photos: int
+    settings: Sequence[Setting], folders: dict[Setting, Path], photos: int, lpips: Distance | None
 ) -> dict[Setting, Difference]:
     found: dict[Setting, list[Difference]] = {setting: [] for setting in settings}
     for index in range(photos):
         reference = read_photo(folders[settings[0]] / f"{index}.png").pixels
         for setting in settings:
             picture = read_photo(folders[setting] / f"{index}.png").pixels
-            found[setting].append(compare_pictures(picture, reference))
+            found[setting].append(compare_pictures(picture, reference, lpips))
     return {setting: worst(differences) for setting, differences in found.items()}
 
 

@@ -16,6 +16,7 @@ def as_markdown(report: Report) -> str:
             _decibels(result),
             f"{result.difference.largest:.1f}",
             _percent(result.difference.light, 2),
+            "" if result.difference.lpips is None else f"{result.difference.lpips:.4f}",
             f"{result.seconds['total']:.3f}",
             f"{result.images_a_minute:.1f}",
             "?" if result.peak_bytes is None else f"{result.peak_bytes / 1e6:.0f}",
@@ -23,8 +24,8 @@ def as_markdown(report: Report) -> str:
         for result in report.results
     ]
     heads = [
-        "setting", "times as fast", "PSNR, dB", "largest, 1/255", "light error", "s a photo",
-        "photos a minute", "peak, MB",
+        "setting", "times as fast", "PSNR, dB", "largest, 1/255", "light error", "LPIPS",
+        "s a photo", "photos a minute", "peak, MB",
     ]  # fmt: skip
     stages = [
         [

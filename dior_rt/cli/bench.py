@@ -16,6 +16,7 @@ from dior_rt.cli.extras import needs_extra
 from dior_rt.errors import DeviceError, InputError
 
 if TYPE_CHECKING:
+    from dior_rt.bench.difference import Distance
     from dior_rt.bench.worker import Pair
 
 
@@ -56,6 +57,9 @@ def bench(
     compare: Annotated[
         Path | None, typer.Option(metavar="OLD.json", help="Print the ratios to an older benchmark.")
     ] = None,
+    lpips: Annotated[
+        bool, typer.Option("--lpips", help="Also the error that the eye sees; needs dior-rt[lpips].")
+    ] = False,
     debug: options.Debug = False,
 ) -> None:
     """Measure speed and, against the reference run, error: of steps, solvers, presets, devices and kernels.
@@ -84,6 +88,7 @@ def bench(
             from dior_rt.bench.plot import plot as draw
         if plot.suffix.lower() != ".png":
             raise InputError(f"Cannot write {plot}: a plot is a .png file.")
+    distance = _lpips() if lpips else None
     for path in filter(None, (json_file, plot)):
         check_writable(path)
     old = read_report(compare) if compare else None
@@ -101,7 +106,7 @@ def bench(
         pairs = _pairs(files or [], stack, megapixels)
         photos = [read_photo(Path(pair.photo)) for pair in pairs]
         with _progress(count_runs(settings, repeats)) as advance:
-            outcome = measure(settings, pairs, repeats, advance, strict=bool(device or ops))
+            outcome = measure(settings, pairs, repeats, advance, strict=bool(device or ops), lpips=distance)
         report = make_report(outcome, this_machine(), bundles, pairs, photos, repeats)
     typer.echo(as_markdown(report))
     if old:
@@ -127,6 +132,13 @@ def _kernels(asked: list[str] | None) -> list[str]:
     except KernelError:  # there is no OpenCL
         devices = []
     return list(dict.fromkeys([best, *devices, "numpy"]))
+
+
+def _lpips() -> Distance:
+    """LPIPS with AlexNet, as most papers report it."""
+    with needs_extra("lpips", "bench --lpips"):
+        from dior_rt.training.evaluation.lpips import Lpips
+    return Lpips("alex")
 
 
 def _short(name: str) -> str:
