@@ -52,15 +52,14 @@ def test_the_quotient_of_matte_white_light_is_exact() -> None:
     source, target = rng.uniform(0.3, 1, (2, 24, 32, 3)).astype(np.float32)
     photo, truth = (OPS.encode_srgb(albedo * light, np.uint8) for light in (source, target))
     relit = quotient(photo, source, target)
-    assert np.abs(relit.astype(float) - truth).mean() < 2 < np.abs(photo.astype(float) - truth).mean()
+    # The 0.02 that the quotient adds to both maps costs a few codes of 255.
+    assert np.abs(relit.astype(float) - truth).mean() < 3 < 10 < np.abs(photo.astype(float) - truth).mean()
     assert np.array_equal(quotient(photo, source, source), photo)
 
 
 def test_the_quotient_of_maps_smaller_than_the_photo() -> None:
     ones = np.ones((6, 8, 3), np.float32)
-    twice = OPS.decode_srgb(
-        quotient(PHOTO, ones, ones * np.float32(2.02) - np.float32(0.02) + np.float32(0.02))
-    )
+    twice = OPS.decode_srgb(quotient(PHOTO, ones, ones * np.float32(2.02)))
     assert np.median(twice / OPS.decode_srgb(PHOTO)) == pytest.approx(2, rel=0.03)
 
 
@@ -110,7 +109,9 @@ def test_a_bundle_is_measured_with_its_own_settings_and_those_asked_for(mini_bun
     assert len(open_methods(mini_bundle, Settings(steps=manifest.steps))) == 1
     task = next(iter(open_benchmarks(renders)[0]))
     strokes = task.control("dense")
-    assert not np.array_equal(own.relight(task.source, strokes), asked.relight(task.source, strokes))
+    relit = own.relight(task.source, strokes)
+    assert np.array_equal(relit, own.relight(task.source, strokes))
+    assert not np.array_equal(relit, asked.relight(task.source, strokes))
 
 
 def test_a_bundle_from_end_to_end(mini_bundle, renders, tmp_path) -> None:
@@ -128,8 +129,6 @@ def test_a_bundle_from_end_to_end(mini_bundle, renders, tmp_path) -> None:
             assert controls[3:] == ["true maps", "estimated maps", "dense", "strokes"]
             assert table.rows[-1].seconds > 0
         assert evaluation.control.response.dabs == 1 and evaluation.borders.photos == 1
-    again, _ = evaluate(mini_bundle, renders, Settings(steps=1), plan)
-    assert again[0].control == evaluations[0].control
     text = markdown(evaluations)
     assert text.count("| strokes |") == 4 and "cut from the true Lumi map" in text
     assert json.loads(as_json(evaluations))[1]["control"]["response"]["dabs"] == 1

@@ -1,6 +1,8 @@
 """SynthBench: rendered by the real renderer, small; human figures from made files in MakeHuman's layout."""
 
 import gzip
+import json
+from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError
 
 import numpy as np
@@ -63,7 +65,7 @@ def test_quads_become_triangles_that_enclose_the_same(makehuman) -> None:
     assert len(mesh.faces) == 2 * len(SIDES) and mesh.uv.min() == 0 and mesh.uv.max() == 1
     corners = mesh.vertices[mesh.faces].astype(float)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    assert areas.sum() == pytest.approx(2 * 4 * 2 + 2 * 17 * 2 + 17 * 4)
+    assert areas.sum() == pytest.approx(2 * 4 * 2 + 2 * 4 * 17 + 2 * 17)
 
 
 def test_a_person_stands_where_and_as_tall_as_asked(makehuman) -> None:
@@ -105,13 +107,13 @@ def test_pairs_differ_much_are_resumed_and_can_be_read(tmp_path) -> None:
 
 
 def test_another_recipe_or_no_recipe_in_the_folder(tmp_path) -> None:
-    (tmp_path / "synthbench.json").write_text('{"pairs": 1}')
+    (tmp_path / "synthbench.json").write_text(json.dumps(asdict(Recipe(1))))
     with pytest.raises(InputError, match="holds a SynthBench of another recipe"):
         render_synthbench(tmp_path, Recipe(1, seed=5))
     (tmp_path / "synthbench.json").write_text("no")
     with pytest.raises(InputError, match="describes no SynthBench"):
         render_synthbench(tmp_path, Recipe(1))
-    (tmp_path / "synthbench.json").write_text('{"pairs": 1}')
+    (tmp_path / "synthbench.json").write_text(json.dumps(asdict(Recipe(1))))
     with pytest.raises(InputError, match="has no pairs"):
         open_benchmarks(tmp_path)
 

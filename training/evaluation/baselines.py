@@ -28,7 +28,11 @@ def match(source: Photo, truth: Photo) -> Photo:
 def quotient(photo: Photo, source: Raster, target: Raster) -> Photo:
     """photo * (target + e) / (source + e) in linear light, of two Lumi maps (h, w, 3).
 
-    Maps smaller than the photo reach it as the runtime's own light does: edge-aware.
+    Maps of the photo's size act pixel by pixel; smaller ones reach it as the runtime's own light does,
+    edge-aware.
     """
+    ratio = (target + E) / (source + E)
+    if ratio.shape == photo.shape:
+        return OPS.encode_srgb(OPS.decode_srgb(photo) * ratio, np.uint8)  # type: ignore[return-value]
     before = OPS.reduce_photo(photo, source.shape[:2])
-    return OPS.transfer(photo, before, before * (target + E) / (source + E))  # type: ignore[return-value]
+    return OPS.transfer(photo, before, before * ratio)  # type: ignore[return-value]
