@@ -56,17 +56,16 @@ def check_block(
 
 def load_block(config: TransformerConfig, weights: Weights, index: int) -> QwenImageTransformerBlock:
     """One of diffusers' blocks with its weights, LoRAs merged; nothing else is read."""
-    with torch.device("meta"):
-        block = QwenImageTransformerBlock(
-            config.width,
-            config.num_attention_heads,
-            config.attention_head_dim,
-            zero_cond_t=config.zero_cond_t,
-        )
-    names = block.state_dict().keys()
-    state = {name: torch.from_numpy(weights[f"transformer_blocks.{index}.{name}"]) for name in names}
-    block.load_state_dict(state, assign=True)
-    return block.eval()
+    block = empty_block(config)
+    load_weights(block, f"transformer_blocks.{index}.", weights)
+    return block
+
+
+def load_weights(module: torch.nn.Module, at: str, weights: Weights) -> None:
+    """Fill a module that was made without memory with the tensors whose names start with `at`."""
+    state = {name: torch.from_numpy(weights[at + name]) for name in module.state_dict()}
+    module.load_state_dict(state, assign=True)
+    module.eval()
 
 
 def empty_block(config: TransformerConfig) -> QwenImageTransformerBlock:

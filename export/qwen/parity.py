@@ -6,7 +6,6 @@ bar the export fails; the figures go into the manifest. The transformer's blocks
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
 from pathlib import Path
 from typing import Any, Final
@@ -14,12 +13,11 @@ from typing import Any, Final
 import numpy as np
 import torch
 from diffusers import AutoencoderKLQwenImage
-from torch import nn
 from transformers.models.qwen2_5_vl.modeling_qwen2_5_vl import Qwen2_5_VLDecoderLayer, Qwen2_5_VLVisionBlock
 
-from dior_rt.engine import Engine
+from dior_rt.engine import Engine, Feeds
 from dior_rt.export.check import ExportError
-from dior_rt.export.qwen.errors import BLOCK_BAR
+from dior_rt.export.qwen.errors import BLOCK_BAR, load_weights
 from dior_rt.export.qwen.graph import Precision
 from dior_rt.export.qwen.text import TextConfig
 from dior_rt.export.qwen.weights import Checkpoint, Weights, read_config
@@ -86,14 +84,7 @@ def check_text_layer(
     return error
 
 
-def load_weights(module: nn.Module, at: str, weights: Weights) -> None:
-    """Fill a module that was made without memory with the tensors under `at`."""
-    state = {name: torch.from_numpy(weights[at + name]) for name in module.state_dict()}
-    module.load_state_dict(state, assign=True)
-    module.eval()
-
-
-def _text_block(config: TextConfig, weights: Weights, index: int) -> tuple[Mapping[str, Array], Array]:
+def _text_block(config: TextConfig, weights: Weights, index: int) -> tuple[Feeds, Array]:
     text = _plain_attention(config.text)
     with torch.device("meta"):
         layer = Qwen2_5_VLDecoderLayer(text, index)
@@ -106,7 +97,7 @@ def _text_block(config: TextConfig, weights: Weights, index: int) -> tuple[Mappi
     return feeds, out[0].numpy()
 
 
-def _vision_block(config: TextConfig, weights: Weights, index: int) -> tuple[Mapping[str, Array], Array]:
+def _vision_block(config: TextConfig, weights: Weights, index: int) -> tuple[Feeds, Array]:
     vision = _plain_attention(config.vision)
     with torch.device("meta"):
         block = Qwen2_5_VLVisionBlock(vision)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import resource
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -252,6 +253,16 @@ def test_too_small_a_disk_is_told_before_anything_is_written(folders, tmp_path, 
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
     refuse(folders[True], tmp_path, r"Too little room at .*: the export writes 0\.0 GB", BundleError)
+
+
+def test_a_disk_that_fills_up_on_the_way_leaves_nothing(folders, tmp_path):
+    # No file may grow beyond 200 KB: to the program that is a write that fails, as on a full disk.
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        refuse(folders[True], tmp_path, "Cannot write the bundle", BundleError)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_a_bundle_that_is_there_stays_as_it_was_when_the_export_fails(folder, tmp_path):
