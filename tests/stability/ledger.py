@@ -93,8 +93,8 @@ def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
         assert np.isfinite(got).all(), f"{case}, {where}: the result is not finite"
         apart = np.abs(got.astype(np.float64) - want.astype(np.float64)) / scale
         seen = float(apart.max(initial=0))
-        shown = shown or (f"{seen:.2f}" if bound >= 0.1 else f"{seen:.1e}")
-        ledger.note(module, Entry(case, where, unit, bound, seen, shown))
+        usual = "exact" if bound == 0 else f"{seen:.2f}" if bound >= 0.1 else f"{seen:.1e}"
+        ledger.note(module, Entry(case, where, unit, bound, seen, shown or usual))
         assert seen <= bound, f"{case}, {where}: off by {seen:.3g} {unit}; {bound:g} is allowed"
 
     return hold
@@ -104,7 +104,7 @@ def _table(entries: list[Entry]) -> str:
     columns = list(dict.fromkeys(entry.where for entry in entries))
     rows: dict[tuple[str, str], dict[str, str]] = {}
     for entry in entries:
-        cell = "exact" if entry.bound == 0 else f"{entry.shown} ({entry.bound:g})"
+        cell = f"{entry.shown} ({entry.bound:g})" if entry.bound else entry.shown
         rows.setdefault((entry.case, entry.unit), {})[entry.where] = cell
     lines = ["| case | error in | " + " | ".join(columns) + " |", "|---" * (2 + len(columns)) + "|"]
     for (case, unit), cells in rows.items():

@@ -7,9 +7,7 @@ the whole graph; those of qwen are this project's export.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,17 +56,33 @@ def test_velocity(bundle, network, usual_feeds, hold, case):
         hold(f"mini: {case}", precision, got, want, bound, "largest value", scale)
 
 
-@pytest.fixture(scope="module")
-def model():
-    """A tiny QwenImageTransformer2DModel with random weights: (config, weights by name)."""
-    pytest.importorskip("diffusers")
-    sys.path.insert(0, str(Path(__file__).parents[1] / "qwen"))
-    import tiny_qwen
+CONFIG = TransformerConfig(
+    in_channels=16,
+    out_channels=4,
+    num_layers=1,
+    attention_head_dim=16,
+    num_attention_heads=3,
+    joint_attention_dim=32,
+    axes_dims_rope=(4, 6, 6),
+    zero_cond_t=False,
+)
 
-    transformer = tiny_qwen.transformer(layers=1, zero_cond_t=False)
-    known = TransformerConfig.__dataclass_fields__.keys() - {"patch_size"}
-    config = TransformerConfig(**{name: transformer.config[name] for name in known})
-    return config, {name: weight.numpy() for name, weight in transformer.state_dict().items()}
+
+def block_weights() -> dict[str, np.ndarray]:
+    """Random weights of one block, by the names of diffusers' QwenImageTransformer2DModel."""
+    random, width = np.random.default_rng(6), CONFIG.width
+    layers = {f"attn.{name}": (width, width) for name in ("to_q", "to_k", "to_v", "to_out.0", "to_add_out")}
+    layers |= {f"attn.add_{role}_proj": (width, width) for role in "qkv"}
+    for stream in ("img", "txt"):
+        layers[f"{stream}_mlp.net.0.proj"] = (4 * width, width)
+        layers[f"{stream}_mlp.net.2"] = (width, 4 * width)
+    weights = {}
+    for name, (outputs, inputs) in layers.items():
+        weights[f"{name}.weight"] = random.standard_normal((outputs, inputs)) / np.sqrt(inputs)
+        weights[f"{name}.bias"] = 0.1 * random.standard_normal(outputs)
+    for name in ("norm_q", "norm_k", "norm_added_q", "norm_added_k"):
+        weights[f"attn.{name}.weight"] = 1 + 0.1 * random.standard_normal(CONFIG.attention_head_dim)
+    return {f"transformer_blocks.0.{name}": value.astype(np.float32) for name, value in weights.items()}
 
 
 def block_feeds(width: int, stream: float, modulation: float, distinct: float = 1) -> dict[str, np.ndarray]:
@@ -101,12 +115,11 @@ BLOCKS = {
 
 
 @pytest.mark.parametrize("case", BLOCKS)
-def test_qwen_block(model, hold, tmp_path, case):
-    config, weights = model
-    feeds = block_feeds(config.width, **BLOCKS[case])
+def test_qwen_block(hold, tmp_path, case):
+    feeds = block_feeds(CONFIG.width, **BLOCKS[case])
     for precision, bound in BLOCK.items():
         path = tmp_path / f"{precision}.onnx"
-        write_block(path, config, weights, 0, precision)
+        write_block(path, CONFIG, block_weights(), 0, precision)
         if precision == "fp32":
             want = twin.Network(path).run(feeds)
         got = Engine(path).run(feeds)
