@@ -6,6 +6,7 @@ python -m dior_rt.bench.presets --renders held-out --find     # the cheapest tha
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,6 +16,7 @@ from dior_rt.bench.cases import Case, from_renders, made_up
 from dior_rt.bench.promise import Kept, find, keep, settings, write_presets
 from dior_rt.bench.tables import table
 from dior_rt.cli.extras import needs_extra
+from dior_rt.errors import DiorError, InputError
 from dior_rt.presets import PROMISES, read_presets
 from dior_rt.relight import Relighter
 
@@ -24,9 +26,9 @@ TOLERANCES = (0.5, 1.0, 2.0, 4.0)  # of 255
 def main(
     bundle: Annotated[Path | None, typer.Argument(help="[default: the one that ships]")] = None,
     renders: Annotated[
-        Path | None, typer.Option(help="Held-out renders [default: scenes made by arithmetic].")
+        Path | None, typer.Option(help="Held-out renders, beside scenes made by arithmetic.")
     ] = None,
-    cases: Annotated[int, typer.Option(min=1)] = 50,
+    cases: Annotated[int, typer.Option(min=1, help="Of either kind.")] = 50,
     search: Annotated[
         bool, typer.Option("--find", help="Search, and put what is found into BUNDLE.")
     ] = False,
@@ -34,6 +36,8 @@ def main(
 ) -> None:
     """Measure the presets of BUNDLE against the reference; exits with 1 where a promise is broken."""
     relighter = Relighter(bundle, device="cpu", threads=threads)
+    if relighter.bundle.manifest.grid is None:
+        raise InputError("Presets are measured of models that predict light on a grid.")
     chosen = _cases(renders, cases)
     if search:
         found = find(relighter, chosen, lambda line: typer.echo(line, err=True))
@@ -75,11 +79,15 @@ def as_markdown(kept: dict[str, Kept], ways: dict[str, dict[str, Any]]) -> str:
 
 
 def _cases(renders: Path | None, count: int) -> list[Case]:
-    if renders is None:
-        return made_up(count)
-    with needs_extra("train"):
-        return from_renders(renders, count)
+    cases = made_up(count)
+    if renders is not None:
+        with needs_extra("train"):
+            cases += from_renders(renders, count)
+    return cases
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    try:
+        typer.run(main)
+    except DiorError as error:
+        sys.exit(f"dior-rt: {error}")

@@ -25,7 +25,7 @@ from dior_rt.bundle import default_bundle, read_bundle
 from dior_rt.presets import PROMISES, Preset, read_presets
 from dior_rt.relight import Relighter
 
-FEW = 4
+FEW = 3
 
 
 @pytest.fixture(scope="module")
