@@ -11,7 +11,8 @@ from dior_rt.kernels import Strokes
 
 Picture = Image.Image | NDArray
 
-BRIGHTEST = 1e6  # of a float photo's samples: the sum of a whole photo's light stays a float32
+#: Times white, of a float photo: what is brighter, float32 cannot take down to what a display shows.
+BRIGHTEST = 16
 
 SHAPE_TOLERANCE = (
     0.01  # of a side; resizing by any whole number of pixels stays within it, or within one pixel
@@ -26,7 +27,7 @@ def read_pixels(photo: Picture) -> NDArray:
     pixels = np.asarray(photo)
     _check_array("a photo", pixels, channels=3)
     if pixels.dtype == np.float32 and not (pixels.min() >= 0 and pixels.max() <= BRIGHTEST):
-        raise InputError(f"A float photo must be finite and >= 0, and at most {BRIGHTEST:g} times white.")
+        raise InputError(f"A float photo must be finite and >= 0, and at most {BRIGHTEST} times white.")
     return pixels
 
 
