@@ -16,6 +16,7 @@ from dior_rt.training.evaluation.metrics import (
     rising,
     rmse,
     scaled_psnr,
+    speckle,
     ssim,
     steps_not_worse,
 )
@@ -37,6 +38,16 @@ def test_psnr_and_ssim_agree_with_scikit_image() -> None:
     assert psnr(NOISE, OTHER) == pytest.approx(peak_signal_noise_ratio(OTHER, NOISE))
     assert ssim(NOISE, OTHER) == pytest.approx(structural_similarity(NOISE, OTHER, channel_axis=2))
     assert ssim(NOISE, NOISE) == pytest.approx(1)
+
+
+def test_speckle_is_what_a_median_takes_away() -> None:
+    grey = np.full((20, 30, 3), 100, np.uint8)
+    assert speckle(grey) == 0
+    grey[:, 15:] = 200
+    assert speckle(grey) == 0  # edges stay
+    salt = np.full((20, 30, 3), 100, np.uint8)
+    salt[1::4, 1::4] = 250
+    assert speckle(salt) == pytest.approx(150 * 5 * 8 / 600)
 
 
 def test_the_interval_is_that_of_the_mean() -> None:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from dior_rt.errors import InputError, MissingExtraError
-from dior_rt.training.evaluation import people
+from dior_rt.training.evaluation import people, synthbench
 from dior_rt.training.evaluation.benchmarks import open_benchmarks
 from dior_rt.training.evaluation.metrics import psnr
-from dior_rt.training.evaluation.synthbench import FIRST, MOST_COPY, Recipe, render_synthbench, staged
+from dior_rt.training.evaluation.synthbench import FIRST, MOST_COPY, Recipe, make, render_synthbench, staged
 from dior_rt.training.scenes import scene
 
 BOX = [(x, y, z) for y in (-8, 9) for x in (-2, 2) for z in (-1, 1)]
@@ -87,7 +87,7 @@ def test_scenes_are_none_that_training_can_have() -> None:
 
 
 def test_pairs_differ_much_are_resumed_and_can_be_read(tmp_path) -> None:
-    out, recipe = tmp_path / "bench", Recipe(2, seed=3, resolution=24, samples=2)
+    out, recipe = tmp_path / "bench", Recipe(2, seed=3, resolution=24, samples=2, speckle=255.0)
     render_synthbench(out, recipe, (0, 2))
     assert len(open_benchmarks(out)[0]) == 1
     before = (out / "0000" / "target.png").stat().st_mtime_ns
@@ -104,6 +104,12 @@ def test_pairs_differ_much_are_resumed_and_can_be_read(tmp_path) -> None:
         assert np.array_equal(strokes.light[drawn], task.target_lumi[drawn])
         assert not strokes.light[~drawn].any()
         assert task.control("dense").mask.all()
+
+
+def test_noise_that_does_not_go_is_told(monkeypatch) -> None:
+    monkeypatch.setattr(synthbench, "STRIDE", 1)
+    with pytest.raises(InputError, match="take more samples than 1"):
+        make(0, Recipe(1, resolution=16, samples=1, speckle=0.0))
 
 
 def test_another_recipe_or_no_recipe_in_the_folder(tmp_path) -> None:

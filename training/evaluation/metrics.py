@@ -48,6 +48,15 @@ def ssim(picture: Photo, truth: Photo) -> float:
     return float(structural_similarity(picture, truth, channel_axis=2))
 
 
+def speckle(picture: Photo) -> float:
+    """The mean distance of a picture's pixels to the median of their 3 x 3 neighbours, in 0..255: its noise,
+    and its finest texture."""
+    from scipy.ndimage import median_filter
+
+    codes = picture.astype(np.float64)
+    return float(np.abs(codes - median_filter(codes, (3, 3, 1))).mean())
+
+
 def interval(values: Sequence[float], level: float = 0.95, seed: int = 0) -> tuple[float, float]:
     """The percentile bootstrap interval of the mean (Efron 1979): of the means of RESAMPLES resamples, the
     inner `level`. Of one value, that value."""

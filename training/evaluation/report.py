@@ -107,10 +107,7 @@ def _control(control: Control) -> Iterator[str]:
 
 def contact_sheet(examples: Sequence[Example]) -> Image.Image:
     """A row a task: source, strokes (grey where unspecified), result, truth."""
-    rows = [[Image.fromarray(picture) for picture in _pictures(example)] for example in examples]
-    for row in rows:
-        for picture in row:
-            picture.thumbnail((CELL, CELL))
+    rows = [[_cell(picture) for picture in _pictures(example)] for example in examples]
     height = LINE + sum(row[0].height + LINE + GAP for row in rows)
     sheet = Image.new("RGB", (len(COLUMNS) * (CELL + GAP) + GAP, height), "white")
     pen, top = ImageDraw.Draw(sheet), LINE
@@ -122,6 +119,15 @@ def contact_sheet(examples: Sequence[Example]) -> Image.Image:
             sheet.paste(picture, (GAP + number * (CELL + GAP), top + LINE))
         top += row[0].height + LINE + GAP
     return sheet
+
+
+def _cell(picture: Photo) -> Image.Image:
+    """A picture that fits a cell: smaller ones a whole number of times as large."""
+    cell = Image.fromarray(picture)
+    if (times := CELL // max(cell.size)) > 1:
+        return cell.resize((times * cell.width, times * cell.height), Image.Resampling.NEAREST)
+    cell.thumbnail((CELL, CELL))
+    return cell
 
 
 def _pictures(example: Example) -> tuple[Photo, Photo, Photo, Photo]:

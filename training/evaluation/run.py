@@ -194,7 +194,9 @@ def run_control(model: Model, folder: Path, views: int, dabs: int) -> Control | 
 
 
 def run_borders(model: Model, folder: Path) -> control.Borders:
-    """Over the pictures of a folder. Raises InputError where there are none."""
+    """Over the pictures of a folder. Raises InputError where there are none, or the model has no light grid."""
+    if model.grid is None:
+        raise InputError(f"{model.name} predicts no light grid, so it has no patch borders to look for.")
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTOS)
     if not paths:
         raise InputError(f"There are no pictures in {folder}.")

@@ -16,7 +16,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from itertools import count
 from pathlib import Path
 from typing import Final
 
@@ -29,7 +28,7 @@ from dior_rt.pictures import Photo, write_photo
 from dior_rt.records import parse, read_json
 from dior_rt.strokes import write_lumi
 from dior_rt.training.evaluation.benchmarks import HEAD, LAST
-from dior_rt.training.evaluation.metrics import psnr
+from dior_rt.training.evaluation.metrics import psnr, speckle
 from dior_rt.training.evaluation.people import person
 from dior_rt.training.evaluation.tasks import OPS, Task
 from dior_rt.training.render import Stage, mitsuba, view
@@ -45,12 +44,16 @@ FORMAT: Final = 1
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a SynthBench is made from. resolution: pixels a side. samples: rays a pixel and source."""
+    """What a SynthBench is made from. resolution: pixels a side. samples: rays a pixel and source.
+
+    speckle: the most that either picture may have, in 0..255; photos of 128 x 128 pixels have 5 to 8.
+    """
 
     pairs: int = 600
     seed: int = 0
     resolution: int = 128
     samples: int = 32
+    speckle: float = 8.0
     format: int = FORMAT
 
 
@@ -79,9 +82,10 @@ def render_synthbench(
 
 
 def make(number: int, recipe: Recipe) -> Task:
-    """The pair of that number: of the first scene from its own place on that has lights different enough."""
+    """The pair of that number: of the first of its STRIDE scenes with lights that differ enough and leave
+    little noise. Raises InputError where there is none."""
     first = FIRST + recipe.seed * 1_000 * STRIDE + number * STRIDE
-    for scene_number in count(first):
+    for scene_number in range(first, first + STRIDE):
         described = staged(scene_number, with_person=number % 2 == 1)
         seen = view(
             Stage.load(described.things),
@@ -95,10 +99,10 @@ def make(number: int, recipe: Recipe) -> Task:
         for _ in range(DRAWS):
             sample = pair(rng, seen, "replace")
             source, truth = (OPS.encode_srgb(linear, np.uint8) for linear in (sample.photo, sample.relit))
-            if psnr(source, truth) <= MOST_COPY:
+            if psnr(source, truth) <= MOST_COPY and max(map(speckle, (source, truth))) <= recipe.speckle:
                 mask = OPS.sparsify(sample.target, "strokes", number).mask
                 return Task(f"{number:04d}", source, truth, sample.source, sample.target, mask, seed=number)
-    raise AssertionError("numbers do not end")
+    raise InputError(f"Pair {number} finds no scene without noise; take more samples than {recipe.samples}.")
 
 
 def staged(number: int, with_person: bool) -> Scene:
