@@ -17,8 +17,8 @@ inline float log2_of(float x) {
        + s * (2.8853900818f + q * (0.9617966939f + q * (0.5770780164f + q * (0.4121985831f + q * 0.3205988980f))));
 }
 
-/* 2^y for y in -126..127, within 2e-7 of itself, and exactly 1 at 0: the nearest integer through the exponent's bits (adding 1.5 * 2^23
- * rounds to it), the rest, in -1/2..1/2, by a minimax polynomial. */
+/* 2^y for y in -126..127, within 2e-7 of itself, and exactly 1 at 0: the nearest integer through the exponent's bits
+ * (adding 1.5 * 2^23 rounds to it), the rest, in -1/2..1/2, by a minimax polynomial. */
 inline float exp2_of(float y) {
   float whole = (y + 12582912.0f) - 12582912.0f, f = y - whole;
   float p = 1.0f + f * (0.6931472657f + f * (0.2402225081f
@@ -51,10 +51,6 @@ inline SAMPLE nearest_code(float x, __global const int *code_of) {
   x = x < 1.0f ? x : 1.0f;
   return (SAMPLE)((code_of[(as_int(x) >> SHIFT) - (as_int(FLOOR) >> SHIFT)] + as_int(x)) >> SHIFT);
 }
-#else
-#define DECODE(sample) linear_of(sample)
-#define ENCODE(x) srgb_of(x)
-#endif
 
 /* Item k: samples k * run .. of `size`. */
 __kernel void decode(__global const SAMPLE *restrict picture, __global const float *restrict light_of,
@@ -67,4 +63,21 @@ __kernel void encode(__global const float *restrict linear, __global const int *
                      __global SAMPLE *restrict picture, int size, int run) {
   int first = get_global_id(0) * run, stop = size - first < run ? size : first + run;
   for (int i = first; i < stop; ++i) picture[i] = ENCODE(linear[i]);
+}
+#else
+#define DECODE(sample) linear_of(sample)
+#define ENCODE(x) srgb_of(x)
+#endif
+
+/* The same of floats, whatever the samples: a photo of integers has a grid of floats too. */
+__kernel void decode_floats(__global const float *restrict picture, __global float *restrict linear,
+                            int size, int run) {
+  int first = get_global_id(0) * run, stop = size - first < run ? size : first + run;
+  for (int i = first; i < stop; ++i) linear[i] = linear_of(picture[i]);
+}
+
+__kernel void encode_floats(__global const float *restrict linear, __global float *restrict picture,
+                            int size, int run) {
+  int first = get_global_id(0) * run, stop = size - first < run ? size : first + run;
+  for (int i = first; i < stop; ++i) picture[i] = srgb_of(linear[i]);
 }

@@ -36,46 +36,72 @@ class OpenCLOps(Ops):
 
     def _decode(self, picture: Picture) -> FloatArray:
         linear = np.empty(picture.shape, np.float32)
-        self._map(self._kernel("decode", picture.dtype), picture, linear, self._decode_table(picture.dtype))
+        if picture.dtype == np.float32:
+            self._map(self._kernel("decode_floats"), picture, linear)
+        else:
+            table = self._session.constant(decode_table(picture.dtype))
+            self._map(self._kernel("decode", picture.dtype), picture, linear, table)
         return linear
 
     def _encode(self, linear: FloatArray, dtype: np.dtype) -> Picture:
         picture = np.empty(linear.shape, dtype)
-        self._map(self._kernel("encode", dtype), linear, picture, self._encode_table(dtype))
+        if dtype == np.float32:
+            self._map(self._kernel("encode_floats"), linear, picture)
+        else:
+            table = self._session.constant(encode_table(dtype).entry)
+            self._map(self._kernel("encode", dtype), linear, picture, table)
         return picture
 
-    def _map(self, kernel: cl.Kernel, given: np.ndarray, result: np.ndarray, table: cl.Buffer | None) -> None:
+    def _map(self, kernel: cl.Kernel, given: np.ndarray, result: np.ndarray, *table: cl.Buffer) -> None:
         """Run an elementwise kernel from one array to another of the same shape."""
         session, flat, out = self._session, given.reshape(-1), result.reshape(-1)
         for band in bands(flat.size, 1, BAND):
             size = band.stop - band.start
             with session.output(out[band]) as buffer:
-                session.launch(kernel, size, 1, session.input(flat[band]), table, buffer, size)
+                session.launch(kernel, size, 1, session.input(flat[band]), *table, buffer, size)
 
     def _reduce_photo(self, picture: Picture, grid: Grid) -> FloatArray:
-        return self._reduce(self._kernel("sum_rows", picture.dtype), picture, None, grid).light
+        kernel = self._kernel("sum_photo", picture.dtype)
+        table = self._decode_table(picture.dtype)
+        return self._reduce(kernel, [picture], table, 3, picture.shape[:2], grid).light
 
     def _reduce_strokes(self, light: Picture, mask: Picture, grid: Grid) -> Strokes:
-        # The floats of strokes are linear already.
-        decode = "" if light.dtype == np.float32 else "DECODE"
-        masked = {"MASK": SAMPLES[mask.dtype.name], "MASK_WHOLE": _whole(mask.dtype), "LIGHT": decode}
-        masked["FAINTEST"] = f"{FAINTEST}f"
-        return self._reduce(self._kernel("sum_rows", light.dtype, **masked), light, mask, grid)
+        if light.dtype == mask.dtype == np.float32:
+            kernel = self._kernel("sum_strokes")
+        else:
+            # The floats of strokes are linear already.
+            types = {
+                "LIGHT": SAMPLES[light.dtype.name],
+                "DECODE_LIGHT": "" if light.dtype == np.float32 else "DECODE",
+                "MASK": SAMPLES[mask.dtype.name],
+                "MASK_WHOLE": _whole(mask.dtype),
+            }
+            kernel = self._kernel("sum_strokes", light.dtype, **types)
+        return self._reduce(kernel, [light, mask], self._decode_table(light.dtype), 4, mask.shape, grid)
 
-    def _reduce(self, sum_rows: cl.Kernel, picture: Picture, mask: Picture | None, grid: Grid) -> Strokes:
-        session, (height, width), (rows, columns) = self._session, picture.shape[:2], grid
+    def _reduce(
+        self,
+        kernel: cl.Kernel,
+        pictures: list[Picture],
+        table: cl.Buffer | None,
+        channels: int,
+        size: Grid,
+        grid: Grid,
+    ) -> Strokes:
+        session, (height, width), (rows, columns) = self._session, size, grid
         result = Strokes(np.empty((*grid, 3), np.float32), np.empty(grid, np.float32))
-        table, sums = self._decode_table(picture.dtype), session.scratch(height * columns * 16)
+        # A photo is summed by samples, strokes by pixels.
+        count = width * 3 if channels == 3 else width
+        sums = session.scratch(rows * width * channels * 4)
+        session.clear(sums)
         for band in bands(height, width, BAND):
-            pixels = [session.input(picture[band]), table]
-            if mask is not None:
-                pixels.append(session.input(mask[band]))
+            given = [session.input(picture[band]) for picture in pictures]
             session.launch(
-                sum_rows, columns, band.stop - band.start, *pixels, sums, width, columns, band.start
+                kernel, count, rows, *given, table, sums, count, height, rows, band.start, band.stop
             )
-        mean_columns = self._kernel("mean_columns")
+        mean_cells = self._kernel("mean_cells")
         with session.output(result.light) as light, session.output(result.mask) as specified:
-            session.launch(mean_columns, columns, rows, sums, light, specified, height, rows, columns)
+            session.launch(mean_cells, columns, rows, sums, light, specified, channels, width, columns)
         return result
 
     def _draw_strokes(self, strokes: list[Stroke], size: Grid) -> Strokes:
@@ -130,19 +156,27 @@ class OpenCLOps(Ops):
         return result
 
     def _kernel(self, name: str, dtype: npt.DTypeLike = np.uint8, **defines: str) -> cl.Kernel:
-        """A kernel for samples of that dtype."""
+        """A kernel for samples of that dtype; strokes are floats unless `defines` says otherwise."""
         kind = np.dtype(dtype)
-        curve = {"SAMPLE": SAMPLES[kind.name], "WHOLE": _whole(kind), "TOP": "0"}
+        macros = {
+            "SAMPLE": SAMPLES[kind.name],
+            "WHOLE": _whole(kind),
+            "TOP": "0",
+            "LIGHT": "float",
+            "DECODE_LIGHT": "",
+            "MASK": "float",
+            "MASK_WHOLE": "1.0f",
+            "FAINTEST": f"{FAINTEST}f",
+            "EPSILON": f"{EPSILON}f",
+            "SIGMA": f"{SIGMA}f",
+            "TILE": f"{draw.TILE}",
+            "LANES": f"{self._session.lanes}",
+        }
         if kind != np.float32:
             table = encode_table(kind)
-            curve |= {
-                "TOP": f"{np.iinfo(kind).max}",
-                "SHIFT": f"{table.shift}",
-                "FLOOR": f"{table.floor:.9g}f",
-            }
-        constants = {"EPSILON": f"{EPSILON}f", "SIGMA": f"{SIGMA}f", "TILE": f"{draw.TILE}"}
-        constants["LANES"] = f"{self._session.lanes}"
-        return self._session.kernel(name, **curve, **constants, **defines)
+            macros["TOP"] = f"{np.iinfo(kind).max}"
+            macros |= {"SHIFT": f"{table.shift}", "FLOOR": f"{table.floor:.9g}f"}
+        return self._session.kernel(name, **macros | defines)
 
     def _decode_table(self, dtype: np.dtype) -> cl.Buffer | None:
         return None if dtype == np.float32 else self._session.constant(decode_table(dtype))

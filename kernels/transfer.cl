@@ -23,19 +23,25 @@ inline float unit(float x) {
 /* x under R = (1 + q)^2: x + (x + e) (R - 1). */
 inline float relit(float x, float q) { return x + (x + EPSILON) * (q * (q + 2.0f)); }
 
-/* Relight the pixel at `from` into `to`: at `offset` from the middle of its cell along the row, with the vertical
- * weights `down`, amid the nodes `near` of its own and the eight cells around. A call would not be vectorised. */
+#if TOP
+#define LIGHTNESS(pixel) ((float)(pixel[0] + 2 * pixel[1] + pixel[2]) * (0.25f / WHOLE / SIGMA))
+#else
+#define LIGHTNESS(pixel) (unit(0.25f * (pixel[0] + 2.0f * pixel[1] + pixel[2])) * (1.0f / SIGMA))
+#endif
+
+/* Relight the pixel at `from` into `to`: at `offset` from the middle of its cell along the row, amid the nodes `near`
+ * of its own cell and the eight around, whose light has been multiplied by their vertical weights `down`. A call would
+ * not be vectorised. */
 __attribute__((always_inline)) inline void relight(__global const SAMPLE *from, __global SAMPLE *to,
-                    __global const float *light_of, __global const int *code_of,
-                    const float4 *near, const float *down, float offset) {
-  float g = unit(0.25f / WHOLE * ((float)from[0] + 2.0f * (float)from[1] + (float)from[2])) * (1.0f / SIGMA);
-  float across[3], total = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
+                                                   __global const float *light_of, __global const int *code_of,
+                                                   const float4 *near, const float *down, float offset) {
+  float g = LIGHTNESS(from), across[3], total = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
   spline(offset, across);
 #pragma unroll
   for (int k = 0; k < 9; ++k) {
     float distance = g - near[k].w;
-    float weight = down[k / 3] * across[k % 3] * rough_reciprocal(1.0f + distance * distance);
-    total += weight;
+    float weight = across[k % 3] * rough_reciprocal(1.0f + distance * distance);
+    total += weight * down[k / 3];
     r += weight * near[k].x;
     s += weight * near[k].y;
     t += weight * near[k].z;
@@ -62,7 +68,8 @@ __kernel void transfer(__global const SAMPLE *restrict photo, __global const flo
   spline((float)(centre - (2 * (long)i + 1) * height) / (2.0f * height), down);
   for (int j = begin; j < end; ++j) {
     float4 near[9];
-    for (int k = 0; k < 9; ++k) near[k] = nodes[(i + k / 3) * (columns + 2) + j + k % 3];
+    for (int k = 0; k < 9; ++k)
+      near[k] = nodes[(i + k / 3) * (columns + 2) + j + k % 3] * (float4)((float3)(down[k / 3]), 1.0f);
     int first = first_pixel(j, width, columns), count = first_pixel(j + 1, width, columns) - first;
     float offset = (float)((2 * (long)first + 1) * columns - (2 * (long)j + 1) * width) / (2.0f * width);
     size_t start = 3 * ((size_t)y * width + first);
@@ -70,15 +77,14 @@ __kernel void transfer(__global const SAMPLE *restrict photo, __global const flo
     __global SAMPLE *restrict to = result + start;
     /* As many at a time as the device has lanes, the last of them twice if need be: no remainder is left to be done
      * one by one. Of wide cells, a quarter of the time went there. */
-    int lanes = count < LANES ? count : LANES;
-    for (int x = 0; x < count; x += lanes) {
-      int at = x + lanes < count ? x : count - lanes;
-      if (lanes == LANES) {
+    for (int x = 0; x < count && count >= LANES; x += LANES) {
+      int at = x + LANES < count ? x : count - LANES;
 #pragma clang loop vectorize_width(LANES) interleave_count(1)
-        for (int k = at; k < at + LANES; ++k) relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down, offset + step * k);
-      } else {
-        for (int k = at; k < at + lanes; ++k) relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down, offset + step * k);
-      }
+      for (int k = at; k < at + LANES; ++k) relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down,
+                                                    offset + step * k);
     }
+#pragma clang loop vectorize(disable)
+    for (int k = 0; k < count && count < LANES; ++k)
+      relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down, offset + step * k);
   }
 }

@@ -1,36 +1,59 @@
-"""The commands by name. `train` is a door: what lies behind it is imported when somebody goes through."""
+"""The commands by name; each is imported, and its options are built, when somebody asks for it."""
 
 from __future__ import annotations
 
 from functools import cache
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from dior_rt import __version__
-from dior_rt.cli import about, bench, convert, pictures
 from dior_rt.cli.extras import needs_extra
+
+STYLE: dict[str, Any] = {
+    "rich_markup_mode": None,
+    "pretty_exceptions_enable": False,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+#: The module of dior_rt.cli that holds each command.
+COMMANDS = {
+    "relight": "pictures",
+    "estimate": "pictures",
+    "sparsify": "pictures",
+    "devices": "about",
+    "info": "about",
+    "bench": "bench",
+    "export": "convert",
+}
+
+
+class Commands(TyperGroup):
+    """COMMANDS, and the groups that the app adds."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Their names."""
+        return [*COMMANDS, *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """One of them, or None."""
+        if cmd_name not in COMMANDS:
+            return super().get_command(ctx, cmd_name)
+        body = getattr(import_module(f"dior_rt.cli.{COMMANDS[cmd_name]}"), cmd_name)
+        alone = typer.Typer(add_completion=False, **STYLE)
+        alone.command(cmd_name)(body)
+        return typer.main.get_command(alone)
+
 
 app = typer.Typer(
     name="dior-rt",
+    cls=Commands,
     help="Relight a photograph from light drawn on it.",
     epilog="dior-rt COMMAND --help explains a command, with examples.",
     add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    **STYLE,
 )
-for body in (
-    pictures.relight,
-    pictures.estimate,
-    pictures.sparsify,
-    about.devices,
-    about.info,
-    bench.bench,
-    convert.export,
-):
-    app.command()(body)
 
 
 @app.callback(invoke_without_command=True)
