@@ -14,7 +14,8 @@ from dior_rt.training.evaluation.baselines import gain, match, quotient
 from dior_rt.training.evaluation.benchmarks import open_benchmarks
 from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_methods
 from dior_rt.training.evaluation.report import CELL, GAP, as_json, contact_sheet, markdown, write_report
-from dior_rt.training.evaluation.run import Evaluation, Figure, Plan, evaluate, run
+from dior_rt.training.evaluation.results import Evaluation, Example, Figure
+from dior_rt.training.evaluation.run import Plan, evaluate, run
 
 OPS = NumpyOps()
 PHOTO = np.random.default_rng(0).integers(20, 90, (24, 32, 3), dtype=np.uint8)
@@ -161,8 +162,6 @@ def test_the_contact_sheet_shows_what_it_says(renders) -> None:
     benchmark = open_benchmarks(renders)[0]
     method = Pictures(renders)
     (task,) = benchmark.first(1)
-    from dior_rt.training.evaluation.run import Example
-
     strokes = task.control("strokes")
     sheet = np.asarray(contact_sheet([Example(task, strokes, 255 - task.source)]))
     assert method.name == renders.name and sheet.shape[0] == 14 + CELL + 14 + GAP

@@ -1,5 +1,7 @@
 """What is said of relighters whose answer to the brush is known beforehand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,8 +91,6 @@ def test_one_stroke_alone_has_no_progress(renders) -> None:
     task = tasks(renders, "change", 1)[0]
     mask = np.zeros(task.source.shape[:2], np.float32)
     mask[2:5, 2:5] = 1
-    from dataclasses import replace
-
     assert progress(copying, [replace(task, mask=mask)]) is None
 
 

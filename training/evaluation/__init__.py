@@ -6,5 +6,5 @@ layouts               benchmarks of real photos, as others published them
 synthbench, people    the renders of SynthBench, and the figures in them
 methods, baselines    what is evaluated, and what needs no network
 control               how a picture answers to the brush
-run, report           a method over a benchmark; JSON, Markdown, contact sheet
+run, results, report  a method over a benchmark; its records; JSON, Markdown, contact sheet
 """

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw
 
 from dior_rt.files import make_folder, replacing
 from dior_rt.training.evaluation.metrics import Photo
-from dior_rt.training.evaluation.run import Control, Evaluation, Example, Figure, Row, Table
+from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import OPS
 
 CELL: Final = 192  # pixels of a picture's longer side on the contact sheet

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -19,7 +19,8 @@ from dior_rt.training.evaluation.benchmarks import open_benchmarks, renders
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.lpips import BACKBONES, Lpips
 from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_methods
-from dior_rt.training.evaluation.metrics import Photo, interval, psnr, rmse, scaled_psnr, ssim
+from dior_rt.training.evaluation.metrics import Photo, psnr, rmse, scaled_psnr, ssim
+from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import DRAWN, OPS, Benchmark, Task
 
 Measure = Callable[[Photo, Photo], float]
@@ -32,73 +33,6 @@ TRUE_CONTROL: Final = "The light is cut from the true Lumi map of the target."
 ESTIMATED_CONTROL: Final = (
     "No true map is known: the light is estimated from the target by the same model, and drives the source."
 )
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A mean over pictures and its 95 % bootstrap interval."""
-
-    mean: float
-    low: float
-    high: float
-
-    @staticmethod
-    def of(values: Sequence[float]) -> Figure:
-        """Of at least one value."""
-        return Figure(float(np.mean(values)), *interval(values))
-
-
-@dataclass(frozen=True)
-class Row:
-    """A method's figures, by the measure's name. control: what light it was given. seconds: a picture."""
-
-    method: str
-    control: str
-    figures: dict[str, Figure]
-    seconds: float | None
-
-
-@dataclass(frozen=True)
-class Table:
-    """estimate: PSNR in dB of the estimated map of the source, after the best global scale, where a true one
-    is known. control: where the light that methods are given comes from."""
-
-    benchmark: str
-    pictures: int
-    control: str
-    rows: tuple[Row, ...]
-    estimate: Figure | None
-
-
-@dataclass(frozen=True)
-class Example:
-    """What the contact sheet shows of one task."""
-
-    task: Task
-    strokes: Strokes | None
-    result: Photo
-
-
-@dataclass(frozen=True)
-class Control:
-    """See `control`; progress is None where no task has two strokes."""
-
-    response: control.Response
-    chroma: control.Chroma
-    progress: control.Progress | None
-    keep_psnr: float
-    add_psnr: float
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """All that was measured of one method. settings: as used, or None for a folder of pictures."""
-
-    method: str
-    settings: Settings | None
-    tables: tuple[Table, ...]
-    control: Control | None = None
-    borders: control.Borders | None = None
 
 
 @dataclass(frozen=True)
@@ -194,7 +128,7 @@ def run_control(model: Model, folder: Path, views: int, dabs: int) -> Control | 
 
 
 def run_borders(model: Model, folder: Path) -> control.Borders:
-    """Over the pictures of a folder. Raises InputError where there are none, or the model has no light grid."""
+    """Over the pictures of a folder. Raises InputError where there are none, or no light grid."""
     if model.grid is None:
         raise InputError(f"{model.name} predicts no light grid, so it has no patch borders to look for.")
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTOS)

@@ -1,0 +1,81 @@
+"""What was measured, as records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dior_rt.kernels import Strokes
+from dior_rt.training.evaluation import control
+from dior_rt.training.evaluation.methods import Settings
+from dior_rt.training.evaluation.metrics import Photo, interval
+from dior_rt.training.evaluation.tasks import Task
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A mean over pictures and its 95 % bootstrap interval."""
+
+    mean: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Figure:
+        """Of at least one value."""
+        return Figure(float(np.mean(values)), *interval(values))
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method's figures, by the measure's name. control: what light it was given. seconds: a picture."""
+
+    method: str
+    control: str
+    figures: dict[str, Figure]
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """estimate: PSNR in dB of the estimated map of the source, after the best global scale, where a true one
+    is known. control: where the light that methods are given comes from."""
+
+    benchmark: str
+    pictures: int
+    control: str
+    rows: tuple[Row, ...]
+    estimate: Figure | None
+
+
+@dataclass(frozen=True)
+class Example:
+    """What the contact sheet shows of one task."""
+
+    task: Task
+    strokes: Strokes | None
+    result: Photo
+
+
+@dataclass(frozen=True)
+class Control:
+    """See `control`; progress is None where no task has two strokes."""
+
+    response: control.Response
+    chroma: control.Chroma
+    progress: control.Progress | None
+    keep_psnr: float
+    add_psnr: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All that was measured of one method. settings: as used, or None for a folder of pictures."""
+
+    method: str
+    settings: Settings | None
+    tables: tuple[Table, ...]
+    control: Control | None = None
+    borders: control.Borders | None = None
