@@ -132,6 +132,8 @@ def read_config(path: Path) -> dict[str, Any]:
 def _shards(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
+    if not path.exists():
+        raise InputError(f"There are no weights at {path}.")
     indices = sorted(path.glob(f"*{INDEX}"))
     if indices:
         places = read_config(indices[0]).get("weight_map")

@@ -188,9 +188,7 @@ def test_a_part_that_is_nowhere_is_named(folder, tmp_path):
     for shard in (folder / "vae").glob("*.safetensors"):
         shard.unlink()
     refuse(folder, tmp_path, "vae should hold one safetensors file", InputError)
-    refuse(
-        folder, tmp_path, "is cut short or is no safetensors", InputError, files=Files(vae=tmp_path / "none")
-    )
+    refuse(folder, tmp_path, "There are no weights at .*none", InputError, files=Files(vae=tmp_path / "none"))
 
 
 def test_weights_in_eight_bits_are_refused(folder, tmp_path):
