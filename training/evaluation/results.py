@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dior_rt.kernels import Strokes
-from dior_rt.training.evaluation import control
+from dior_rt.training.evaluation.control import Borders, Chroma, Progress, Response
 from dior_rt.training.evaluation.methods import Settings
 from dior_rt.training.evaluation.metrics import Photo, interval
 from dior_rt.training.evaluation.tasks import Task
@@ -63,9 +63,9 @@ class Example:
 class Control:
     """See `control`; progress is None where no task has two strokes."""
 
-    response: control.Response
-    chroma: control.Chroma
-    progress: control.Progress | None
+    response: Response
+    chroma: Chroma
+    progress: Progress | None
     keep_psnr: float
     add_psnr: float
 
@@ -78,4 +78,4 @@ class Evaluation:
     settings: Settings | None
     tables: tuple[Table, ...]
     control: Control | None = None
-    borders: control.Borders | None = None
+    borders: Borders | None = None
