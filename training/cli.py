@@ -213,11 +213,14 @@ def evaluate(
     With the bundle's own settings, and once more with those given. Pictures of another method are called
     {task}.png; a name that is missing is told.
     """
+    from dior_rt.files import make_folder
     from dior_rt.training.evaluation.methods import Settings
     from dior_rt.training.evaluation.report import as_json as to_json
     from dior_rt.training.evaluation.report import markdown, write_report
     from dior_rt.training.evaluation.run import Plan, evaluate
 
+    if out:
+        make_folder(out)  # now, rather than after the work
     plan = Plan(views, dabs, lpips, photos)
     evaluations, examples = evaluate(method, benchmark, Settings(steps, guidance, noise_scale), plan)
     if out:

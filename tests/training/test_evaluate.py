@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dior_rt.cli import run as cli
 from dior_rt.errors import BundleError, InputError
 from dior_rt.kernels import NumpyOps
 from dior_rt.relight import Relighter
@@ -171,3 +172,14 @@ def test_the_contact_sheet_shows_what_it_says(renders) -> None:
     assert (cells[1][strokes.mask == 0] == 128).all()
     shown = OPS.encode_srgb(strokes.light, np.uint8)
     assert np.array_equal(cells[1][strokes.mask > 0], shown[strokes.mask > 0])
+
+
+def test_what_cannot_be_done_is_told_before_any_work(mini_bundle, renders, tmp_path, capfd) -> None:
+    (tmp_path / "file").touch()
+    for option, where, saying in (
+        ("--photos", tmp_path, "There are no pictures in"),
+        ("--out", tmp_path / "file", "Cannot make the folder"),
+    ):
+        assert cli(["train", "eval", str(mini_bundle), str(renders), option, str(where)]) == 2
+        said = capfd.readouterr()
+        assert said.err.count("\n") == 1 and saying in said.err and not said.out

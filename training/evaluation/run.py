@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -64,6 +64,7 @@ def evaluate(
     of another method. The examples are those of the first. Raises what reading raises."""
     benchmarks = [found.first(plan.views) for found in open_benchmarks(benchmark)]
     methods = open_methods(folder, asked)
+    photos = list_photos(plan.photos) if plan.photos else []
     measures = dict(MEASURES)
     if plan.lpips:
         measures |= {f"LPIPS {name}": Lpips(name) for name in BACKBONES}
@@ -74,7 +75,7 @@ def evaluate(
         brush, seams = None, None
         if isinstance(method, Model):
             brush = run_control(method, benchmark, plan.views, plan.dabs)
-            seams = run_borders(method, plan.photos) if plan.photos else None
+            seams = run_borders(method, photos) if photos else None
         settings = method.settings if isinstance(method, Model) else None
         tables = tuple(table for table, _ in results)
         evaluations.append(Evaluation(method.name, settings, tables, brush, seams))
@@ -127,14 +128,19 @@ def run_control(model: Model, folder: Path, views: int, dabs: int) -> Control | 
     )
 
 
-def run_borders(model: Model, folder: Path) -> control.Borders:
-    """Over the pictures of a folder. Raises InputError where there are none, or no light grid."""
+def run_borders(model: Model, photos: Sequence[Path]) -> control.Borders:
+    """Over photos. Raises InputError where the model has no light grid."""
     if model.grid is None:
         raise InputError(f"{model.name} predicts no light grid, so it has no patch borders to look for.")
+    return control.borders(model.relight, model.estimate, model.grid, map(read_picture, photos))
+
+
+def list_photos(folder: Path) -> list[Path]:
+    """The pictures of a folder. Raises InputError where there are none."""
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTOS)
     if not paths:
         raise InputError(f"There are no pictures in {folder}.")
-    return control.borders(model.relight, model.estimate, model.grid, map(read_picture, paths))
+    return paths
 
 
 def _row(method: str, drawn: str, scored: list[dict[str, float]]) -> Row:
