@@ -1,4 +1,8 @@
-"""What several parts are tested with: the model that ships, on a smaller grid and with few steps."""
+"""What several parts are tested with: every way to compute the pixel kernels, and the model that ships, on a
+smaller grid and with few steps.
+
+Every test that asks for `ops` runs on NumPy and on every OpenCL device that is here.
+"""
 
 import dataclasses
 import shutil
@@ -8,6 +12,27 @@ import pytest
 
 from dior_rt.bundle import default_bundle, read_bundle, write_bundle
 from dior_rt.grid import GridRule
+from dior_rt.kernels import Device, KernelError, NumpyOps, OpenCLOps, Ops, list_devices
+
+
+def _devices() -> list[Device]:
+    try:
+        return list_devices()
+    except KernelError:
+        return []
+
+
+DEVICES = _devices()
+
+
+@pytest.fixture(scope="session", params=["numpy", *DEVICES], ids=lambda p: getattr(p, "name", p))
+def ops(request: pytest.FixtureRequest) -> Ops:
+    return NumpyOps() if request.param == "numpy" else OpenCLOps(request.param)
+
+
+@pytest.fixture(scope="session", params=DEVICES, ids=lambda device: device.name)
+def opencl(request: pytest.FixtureRequest) -> Ops:
+    return OpenCLOps(request.param)
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The devices that are here, the shipped model in three precisions, and the ledger of what was seen."""
+"""The shipped model in three precisions, its float64 twin, and the ledger of what was seen."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from dior_rt import Relighter
 from dior_rt.bundle import Bundle, default_bundle, read_bundle, write_bundle
 from dior_rt.family.mini import Mini
 from dior_rt.grid import GridRule
-from dior_rt.kernels import KernelError, NumpyOps, OpenCLOps, list_devices
 
 NOTES = pytest.StashKey[ledger.Ledger]()
 
@@ -45,18 +44,6 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 def hold(request: pytest.FixtureRequest) -> Callable[..., None]:
     """`hold(case, where, got, want, bound, unit, scale)`; see ledger.py."""
     return ledger.holder(request.config.stash[NOTES], request.module)
-
-
-def _devices() -> list:
-    try:
-        return list_devices()
-    except KernelError:
-        return []
-
-
-@pytest.fixture(scope="session", params=["numpy", *_devices()], ids=lambda p: getattr(p, "name", p))
-def ops(request: pytest.FixtureRequest):
-    return NumpyOps() if request.param == "numpy" else OpenCLOps(request.param)
 
 
 @pytest.fixture(scope="session")
