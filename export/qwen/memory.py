@@ -4,14 +4,13 @@
 
 Makes random checkpoints of a wide transformer with a LoRA on every block, and writes their graphs, each in a
 process of its own whose peak is read at the end. What was there before, libraries above all, is taken off.
+The peak is Linux's VmHWM: getrusage's would begin at that of the process that began this one.
 """
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
-import resource
-import sys
 import tempfile
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -28,7 +27,6 @@ from dior_rt.export.qwen.weights import Checkpoint, Merged
 HEADS: Final = 4
 HEAD: Final = 128
 RANK: Final = 64
-UNIT: Final = 1 if sys.platform == "darwin" else 1024  # bytes, or kilobytes, of ru_maxrss
 
 
 def peak(blocks: int, precision: Precision = "fp32") -> float:
@@ -71,10 +69,17 @@ def write(folder: Path, precision: Precision, result: Connection) -> None:
     config = TransformerConfig.read(folder / "model" / "config.json")
     weights = Merged(Checkpoint(folder / "model"), [Lora(folder / "lora.safetensors")])
     (folder / "out").mkdir()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew, at what is held now
+    before = held("VmHWM")
     for _ in write_transformer(folder / "out", config, weights, precision):
         pass
-    result.send((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * UNIT / 1e6)
+    result.send(held("VmHWM") - before)
+
+
+def held(figure: str) -> float:
+    """A figure of this process' memory, as /proc/self/status names it, in megabytes."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{figure}:")) * 1024 / 1e6
 
 
 def main() -> None:
