@@ -84,6 +84,22 @@ def decode_light(encoded: Tensor) -> Tensor:
     return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
 
 
+def spread(drawn: Tensor, patch: int) -> tuple[Tensor, Tensor]:
+    """What the strokes say on average, within some three patches and everywhere, for every cell.
+
+    drawn: (B, 4, h, w), values that are 0 where the mask, the last channel, is. Each result has the means over
+    what is drawn, and how much is drawn: 0 nothing, towards 1 from a hundredth of the cells on.
+    """
+    near = F.avg_pool2d(F.avg_pool2d(drawn, patch), 3, 1, 1)  # (B, 4, h / patch, w / patch)
+    near = F.interpolate(near, scale_factor=float(patch), mode="bilinear")
+    everywhere = drawn.mean(dim=(2, 3), keepdim=True).expand_as(drawn)
+    return _means(near), _means(everywhere)
+
+
+def _means(sums: Tensor) -> Tensor:
+    return sums / (sums[:, 3:] + 0.01)
+
+
 def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
     """E[eps - x0 | x] where x = (1 - sigma) x0 + sigma eps and x0 is Gaussian about `expected` with std SPREAD.
 
@@ -115,7 +131,7 @@ class Mini(nn.Module):
         self.config = config
         width, patch = config.width, config.patch
         fine, half, quarter = config.fine, config.half, config.quarter
-        self.see = nn.Conv2d(10, fine, 3, padding=1)
+        self.see = nn.Conv2d(18, fine, 3, padding=1)
         self.see_half = nn.Conv2d(fine, half, 4, 2, 1)
         self.see_quarter = nn.Conv2d(half, quarter, 4, 2, 1)
         self.embed = nn.Conv2d(quarter, width, patch // 4, patch // 4)
@@ -145,8 +161,9 @@ class Mini(nn.Module):
         linear = srgb_to_linear(photo)
         white, aim = encode_light(linear), torch.log(light + BOUNCED)
         start = aim - torch.log(linear + BOUNCED)  # where the light would have to go on white paper
-        seen = torch.cat([2 * photo - 1, encode_light(light) * mask, start * mask, mask], dim=1)
-        fine = F.silu(self.see(seen))
+        drawn = torch.cat([start * mask, mask], dim=1)  # (B, 4, h, w)
+        seen = [2 * photo - 1, encode_light(light) * mask, drawn, *spread(drawn, self.config.patch)]
+        fine = F.silu(self.see(torch.cat(seen, dim=1)))
         half = F.silu(self.see_half(fine))
         quarter = F.silu(self.see_quarter(half))
         given = torch.cat([photo, linear, white, aim, mask], dim=1)
