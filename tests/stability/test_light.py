@@ -16,7 +16,7 @@ from dior_rt.relight import NOTHING_DRAWN
 
 SIZE = (44, 60)
 SMALLEST = np.finfo(np.float32).tiny  # what is below may be 0 on a device
-CODES = {"fp32": 1.0, "fp16": 2.0, "int8": 20.0}
+CODES = {"fp32": 1.0, "fp16": 2.0, "int8": 10.0}
 
 
 def photo() -> np.ndarray:

@@ -31,7 +31,7 @@ from dior_rt.pixels import BRIGHTEST
 sys.path.insert(0, str(Path(__file__).parents[1] / "runtime"))
 import icc
 
-CODES = {"fp32": 0.6, "fp16": 2.0, "int8": 20.0}
+CODES = {"fp32": 0.6, "fp16": 2.0, "int8": 10.0}
 GAMMA = {"adobe": 563 / 256, "prophoto": 1.8}
 
 

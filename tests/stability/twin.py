@@ -220,8 +220,10 @@ class RotaryEmbedding(OpRun):
 
     op_domain = "com.microsoft"
 
-    def _run(self, x: Array, _: NDArray, cos: Array, sin: Array, interleaved: int = 0) -> tuple[Array]:
-        assert interleaved
+    def _run(
+        self, x: Array, _: NDArray, cos: Array, sin: Array, interleaved: int = 0, **defaults: int
+    ) -> tuple[Array]:
+        assert interleaved and not any(defaults.values())
         pairs = x.reshape(*x.shape[:2], -1, cos.shape[-1], 2)  # (B, tokens, heads, d / 2, 2)
         cos, sin = cos[:, None], sin[:, None]
         a, b = pairs[..., 0], pairs[..., 1]
