@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from dior_rt.family.mini import Mini
 from dior_rt.family.qwen import Qwen
 from dior_rt.family.qwen_frame import shrink
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
+from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
 from dior_rt.sampler import Array, State, Velocity, between, draw_noise, sample
@@ -89,9 +91,11 @@ class Relighter:
         there or computes wrong results.
         """
         self.bundle = read_bundle(Path(bundle) if bundle else default_bundle())
-        self._family = open_family(self.bundle, device, threads)
-        with _device_errors():
-            self._ops = open_ops(ops)
+        with ThreadPoolExecutor(1) as pool:  # a cold device compiles its kernels while the network loads
+            opening = pool.submit(open_ops, ops)
+            self._family = open_family(self.bundle, device, threads)
+            with _device_errors():
+                self._ops = opening.result()
         self.device, self.device_reason = self._family.device, self._family.reason
         self.ops, self.ops_reason = self._ops.name, self._ops.reason
 
@@ -154,7 +158,7 @@ class Relighter:
         condition = self._family.encode(encoded, drawn, "relight")
         x0, taken = self._sample(condition, how, seed, progress)
         watch.lap("steps")
-        relit = self._ops.decode_srgb(self._family.decode_relit(x0, condition))
+        relit = _linear(self._family.decode_relit(x0, condition))
         picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
         watch.lap("transfer")
         return Relit(picture, None, watch.seconds, taken, how, seed, intensity)
@@ -179,9 +183,9 @@ class Relighter:
         """The photo on its raster, linear and sRGB-encoded 0..1."""
         if self.bundle.manifest.grid is None:  # what paints whole pictures has learnt from such as these
             seen = shrink(pixels, raster)
-            return self._ops.decode_srgb(seen), seen
+            return _linear(seen), seen
         source = self._ops.reduce_photo(pixels, raster)
-        return source, np.clip(self._ops.encode_srgb(source, np.float32), 0, 1)
+        return source, np.clip(linear_to_srgb(source), 0, 1).astype(np.float32)
 
     def _reduce_strokes(
         self,
@@ -252,6 +256,11 @@ class Relighter:
         if how.interval == ALWAYS or how.guidance == 1:
             return guided
         return between(*how.interval, guided, self._family.velocity(condition, sigmas, 1.0))
+
+
+def _linear(encoded: Array) -> Array:
+    """A small picture in linear light, without a device's help: that would have to compile for it."""
+    return srgb_to_linear(encoded).astype(np.float32)
 
 
 def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:
