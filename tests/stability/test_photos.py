@@ -255,18 +255,19 @@ def test_a_float_photo_too_bright_is_refused(relighter, factor):
         relighter("fp32", "numpy").relight(np.full((40, 52, 3), factor, np.float32), strokes((40, 52)))
 
 
-SIDE, LEAST = 10_000, 700  # 100 megapixels; MB of a process that relights a small photo
+SIDE = 10_000  # 100 megapixels are 300 MB
 
 
 @pytest.mark.slow
 def test_a_hundred_megapixels(network, hold, tmp_path):
-    """The command itself; its picture in windows, its memory as a multiple of the picture's."""
+    """The command itself: its picture, in windows, and its memory."""
     given, drawn, made = (tmp_path / name for name in ("given.tif", "drawn.npy", "made.png"))
     tile = np.random.default_rng(11).integers(0, 4, (500, 500, 3), dtype=np.uint8)
     ramp = np.linspace(0, 250, SIDE).astype(np.uint8)[:, None, None]
     pixels = np.tile(tile, (SIDE // 500, SIDE // 500, 1)) + ramp
     Image.fromarray(pixels).save(given)
-    family = Mini(read_bundle(default_bundle()), "cpu", 1)
+    shipped = read_bundle(default_bundle())
+    family, scale = Mini(shipped, "cpu", 1), shipped.manifest.noise_scale
     grid = family.raster(SIDE, SIDE)
     sparse = strokes(grid)
     np.save(drawn, np.dstack([sparse.light, sparse.mask]))
@@ -274,20 +275,12 @@ def test_a_hundred_megapixels(network, hold, tmp_path):
     command = [sys.executable, "-m", "dior_rt", "relight", given, drawn, "-o", made, *options]
     subprocess.run(list(map(str, command)), check=True)
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-    hold(
-        "100 megapixels: peak memory",
-        "opencl:0",
-        peak,
-        LEAST,
-        5 * pixels.nbytes / 1e6,
-        "MB above a small photo's",
-    )
+    hold("100 megapixels: peak memory", "--ops auto", peak, 0, 2000, "MB")
 
     source = twin.reduce_photo(pixels, grid)
-    relit = twin.relight_grid(family, network, source, sparse, seed=5, steps=1, guidance=1.0)
-    with Image.open(made) as image:
-        got = np.asarray(image)
+    relit = twin.relight_grid(family, network, source, sparse, 5, steps=1, guidance=1.0, noise_scale=scale)
+    got = read_photo(made).pixels
     for top, left in ((0, 0), (0, SIDE - 64), (SIDE // 2, SIDE // 2), (SIDE - 64, 0), (SIDE - 64, SIDE - 64)):
         window = np.s_[top : top + 64, left : left + 64]
         want = twin.transfer(pixels[window], source, relit, (SIDE, SIDE), (top, left))
-        hold("100 megapixels", "opencl:0", got[window], 255 * np.clip(want, 0, 1), CODES["fp32"], "1/255")
+        hold("100 megapixels", "--ops auto", got[window], 255 * np.clip(want, 0, 1), CODES["fp32"], "1/255")

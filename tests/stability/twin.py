@@ -172,12 +172,13 @@ def relight_grid(
     seed: int,
     steps: int,
     guidance: float,
+    noise_scale: float = 1.0,
 ) -> Array:
     """The light grid `source` (h, w, 3) under strokes of its size, linear; seed draws the noise."""
     encoded = np.clip(encode(source), 0, 1).astype(np.float32)
     condition = family.encode(encoded, strokes, "relight")
-    noise, sigmas = draw_noise(seed, family.noise_shape(condition)), family.sigmas(steps, condition)
-    x0 = euler(network.velocity(condition, guidance), noise, sigmas)
+    noise = noise_scale * draw_noise(seed, family.noise_shape(condition)).astype(np.float64)
+    x0 = euler(network.velocity(condition, guidance), noise, family.sigmas(steps, condition))
     return decode(family.decode_relit(x0, condition))
 
 
