@@ -35,6 +35,7 @@ RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
 BOUNCED = 0.05  # b: light that reaches a place where no source shines, so that drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
+CLOSED = 2.0  # gates begin an eighth open
 SPREAD = 0.5  # of x0 about what the network expects: some 0.12 in sRGB
 
 
@@ -84,16 +85,19 @@ def decode_light(encoded: Tensor) -> Tensor:
     return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
 
 
-def spread(drawn: Tensor, patch: int) -> tuple[Tensor, Tensor]:
-    """What the strokes say on average, within some three patches and everywhere, for every cell.
+def spread(drawn: Tensor, size: int) -> Tensor:
+    """What the strokes say on average some three `size`s around, for every cell, and how much is drawn there.
 
-    drawn: (B, 4, h, w), values that are 0 where the mask, the last channel, is. Each result has the means over
-    what is drawn, and how much is drawn: 0 nothing, towards 1 from a hundredth of the cells on.
+    drawn: (B, 4, h, w), values that are 0 where the mask, the last channel, is. Returns (B, 4, h, w), the
+    means over what is drawn, and 0 for nothing drawn, towards 1 from a hundredth of the cells on.
     """
-    near = F.avg_pool2d(F.avg_pool2d(drawn, patch), 3, 1, 1)  # (B, 4, h / patch, w / patch)
-    near = F.interpolate(near, scale_factor=float(patch), mode="bilinear")
-    everywhere = drawn.mean(dim=(2, 3), keepdim=True).expand_as(drawn)
-    return _means(near), _means(everywhere)
+    near = F.avg_pool2d(F.avg_pool2d(drawn, size), 3, 1, 1)  # (B, 4, h / size, w / size)
+    return _means(F.interpolate(near, scale_factor=float(size), mode="bilinear"))
+
+
+def spread_everywhere(drawn: Tensor) -> Tensor:
+    """As `spread`, over the whole picture."""
+    return _means(drawn.mean(dim=(2, 3), keepdim=True).expand_as(drawn))
 
 
 def _means(sums: Tensor) -> Tensor:
@@ -146,7 +150,7 @@ class Mini(nn.Module):
         self.see_state = nn.Conv2d(3, fine, 3, padding=1)
         self.state_gate = nn.Linear(width, fine)
         self.smooth = nn.Conv2d(fine, fine, 3, padding=1)
-        self.head = nn.Conv2d(fine, 6, 3, padding=1)
+        self.head = nn.Conv2d(fine, 9, 3, padding=1)
         for silent in (self.modulation, self.state_gate, self.head):
             for weight in silent.parameters():
                 nn.init.zeros_(weight)
@@ -162,8 +166,9 @@ class Mini(nn.Module):
         white, aim = encode_light(linear), torch.log(light + BOUNCED)
         start = aim - torch.log(linear + BOUNCED)  # where the light would have to go on white paper
         drawn = torch.cat([start * mask, mask], dim=1)  # (B, 4, h, w)
-        seen = [2 * photo - 1, encode_light(light) * mask, drawn, *spread(drawn, self.config.patch)]
-        fine = F.silu(self.see(torch.cat(seen, dim=1)))
+        said = [drawn, spread(drawn, self.config.patch), spread_everywhere(drawn)]
+        seen = torch.cat([2 * photo - 1, encode_light(light) * mask, *said], dim=1)
+        fine = F.silu(self.see(seen))
         half = F.silu(self.see_half(fine))
         quarter = F.silu(self.see_quarter(half))
         given = torch.cat([photo, linear, white, aim, mask], dim=1)
@@ -188,14 +193,22 @@ class Mini(nn.Module):
         # Near noise the state says nothing, near the image it says all: the gate follows sigma.
         state = self.see_state(x) * self.state_gate(condition)[:, :, None, None]
         cells = F.silu(self.smooth(cells + fine + state))
-        raw, own = self.head(cells).float().chunk(2, dim=1)  # (B, 3, h, w)
+        raw, own, gates = self.head(cells).float().split(3, dim=1)  # (B, 3, h, w)
         photo, linear, white, aim, mask = given.split((3, 3, 3, 3, 1), dim=1)
         own = white + own  # the photo's own light, encoded; of white paper it is the photo itself
         # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
-        ratio = raw + mask * (aim - torch.log(decode_light(own.clamp(max=BRIGHTEST)) + BOUNCED))
-        relit = _relight(photo, linear, ratio)
+        drawn = mask * (aim - torch.log(decode_light(own.clamp(max=BRIGHTEST)) + BOUNCED))
+        relit = _relight(photo, linear, raw + drawn + (1 - mask) * self._reach(drawn, mask, gates))
         expected = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
         return velocity(x, sigma[:, None, None, None], expected)
+
+    def _reach(self, drawn: Tensor, mask: Tensor, gates: Tensor) -> Tensor:
+        """How the light of the strokes goes on beside them: gates say how much of what is drawn nearby, farther
+        off, and everywhere holds for a cell."""
+        drawn, patch = torch.cat([drawn, mask], dim=1), self.config.patch
+        near, far, everywhere = torch.sigmoid(gates - CLOSED).split(1, dim=1)
+        light = near * spread(drawn, patch // 2) + far * spread(drawn, patch)
+        return (light + everywhere * spread_everywhere(drawn))[:, :3]
 
     def _transform(self, tokens: Tensor, condition: Tensor) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells."""

@@ -62,10 +62,9 @@ def awake() -> Mini:
 
 
 @torch.no_grad()
-def test_untrained_it_keeps_the_photo_where_nothing_is_drawn_and_takes_the_photo_for_light() -> None:
+def test_untrained_it_returns_the_photo_if_nothing_is_drawn_and_takes_the_photo_for_light() -> None:
     network, given = Mini(SMALL), inputs(noise=True)
-    silent = (given["mask"] == 0).expand(-1, 3, -1, -1)
-    np.testing.assert_allclose(found(network, given)[silent], 0, atol=1e-5)
+    np.testing.assert_allclose(found(network, {**given, "mask": 0 * given["mask"]}), 0, atol=1e-5)
     given["mode"] += 1
     expected = 2 * encode_light(srgb_to_linear(given["photo"])) - 1
     torch.testing.assert_close(found(network, given), expected, atol=1e-5, rtol=1e-5)
@@ -154,6 +153,18 @@ def test_relit_light_stays_physical(awake) -> None:
     assert bright.clamp(0, 1).min() > 0.99 and dark.clamp(0, 1).max() < 0.01
     black = torch.zeros(1, 3, 4, 4)
     assert (module._relight(black, black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
+
+
+def test_what_is_drawn_is_spread_as_it_is_and_no_farther_than_said() -> None:
+    drawn = torch.zeros(1, 4, 64, 64)
+    drawn[..., 20:24, 20:24] = torch.tensor([2.0, -1.0, 0.0, 1.0])[:, None, None]
+    near, everywhere = module.spread(drawn, 8), module.spread_everywhere(drawn)
+    middle = near[0, :, 20:24, 20:24].mean(dim=(1, 2))
+    assert 0.5 < middle[3] <= 1 and near[..., 48:].abs().max() == 0
+    torch.testing.assert_close(middle[:3] / middle[3], torch.tensor([2.0, -1.0, 0.0]))
+    assert everywhere.std(dim=(2, 3)).max() == 0
+    torch.testing.assert_close(everywhere[0, :3, 0, 0] / everywhere[0, 3, 0, 0], torch.tensor([2.0, -1.0, 0.0]))
+    assert module.spread(0 * drawn, 8).abs().max() == 0
 
 
 def test_colour_is_the_kernels_colour() -> None:
