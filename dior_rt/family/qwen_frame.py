@@ -62,7 +62,7 @@ def shrink(pixels: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
     8 bits stay 8 bits on the way: that is the picture that diffusers' processor shows the model.
     """
     if pixels.dtype == np.uint8:
-        return resize(pixels, size, Image.Resampling.LANCZOS) / np.float32(255)
+        return resize(pixels, size, Image.Resampling.LANCZOS).astype(np.float32) / np.float32(255)
     whole = np.float32(np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else 1)
     return resize(pixels / whole, size, Image.Resampling.LANCZOS).clip(0, 1)
 

@@ -14,7 +14,7 @@ import multiprocessing
 import tempfile
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import torch
 from safetensors.torch import save_file
@@ -50,7 +50,7 @@ def make_model(folder: Path, blocks: int) -> None:
     from diffusers import QwenImageTransformer2DModel  # which the process that is measured does without
 
     width = HEADS * HEAD
-    model = QwenImageTransformer2DModel(
+    model: Any = QwenImageTransformer2DModel(
         num_layers=blocks,
         num_attention_heads=HEADS,
         attention_head_dim=HEAD,
