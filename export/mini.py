@@ -1,4 +1,7 @@
-"""Mini to a bundle: torch's network becomes one ONNX graph, with its weights stored small, held to torch."""
+"""Mini to a bundle: torch's network becomes two ONNX graphs, their weights stored small, held to torch.
+
+"encode" is what photo and strokes say, whatever the flow's state; "velocity" is what every step costs.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,6 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -21,7 +23,7 @@ from onnx_ir.passes.common import ClearMetadataAndDocStringPass
 from torch.export import Dim
 
 from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
-from dior_rt.engine import Engine
+from dior_rt.engine import Engine, Feeds
 from dior_rt.errors import InputError
 from dior_rt.export.check import (
     ExportError,
@@ -35,13 +37,12 @@ from dior_rt.export.lora import merge_lora
 from dior_rt.family import mini
 from dior_rt.files import reason
 from dior_rt.grid import GridRule
+from dior_rt.sampler import Array
 from dior_rt.schedule import ShiftSchedule
-from dior_rt.training.network import LORA, WEIGHTS, load_network
+from dior_rt.training.network import LORA, WEIGHTS, Features, Mini, load_network
 
 Weights = Literal["fp16", "fp32"]
 
-GRAPH: Final = "model.onnx"
-PROBE: Final = "probe.npz"
 LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothing
 
 
@@ -85,12 +86,12 @@ def export_checkpoint(
 
 
 def export_network(
-    network: torch.nn.Module, recipe: Recipe, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
+    network: Mini, recipe: Recipe, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
 ) -> Bundle:
-    """Write a network's bundle at `out`. Its inputs and output are those of mini in docs/contracts.md.
+    """Write a network's bundle at `out`.
 
-    weights: how they are stored; for fp16 the network's own are rounded in place. The graph computes in
-    float32 either way. Raises InputError for a recipe that cannot be, ExportError where the graph computes
+    weights: how they are stored; for fp16 the network's own are rounded in place. The graphs compute
+    in float32 either way. Raises InputError for a recipe that cannot be, ExportError where they compute
     something else than torch with the same weights, and BundleError where nothing can be written.
     """
     check_target(out, overwrite)
@@ -98,37 +99,115 @@ def export_network(
     network = network.eval()
     parity = {"weights_as_fp16": round_to_half(network, grid)} if weights == "fp16" else {}
     with tempfile.TemporaryDirectory() as scratch:
-        graph, probe = Path(scratch) / GRAPH, Path(scratch) / PROBE
-        convert(network, graph, grid.multiple)
-        if weights == "fp16":
-            store_as_half(graph)
-        engine = open_checked(graph)
-        bind, sigmas = partial(mini.bind, engine), recipe.schedule.sigmas(recipe.steps)
-        parity["evaluation"] = check_evaluations(network, engine, grid)
-        parity["sampling_db"] = check_sampling(network, bind, grid, sigmas, recipe.guidance)
-        save_probe(network, probe, grid)
-        graphs = {"velocity": Graph(GRAPH, engine.inputs, engine.outputs, PROBE)}
+        parts = {"encode": Encode(network), "velocity": Step(network)}
+        files = {}
+        for name, part in parts.items():
+            files |= write_graph(part, name, Path(scratch), grid.multiple, weights)
+        engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
+        found = mini.Graphs(**engines)
+        parity["evaluation"] = check_evaluations(network, found, grid)
+        sigmas = recipe.schedule.sigmas(recipe.steps)
+        parity["sampling_db"] = check_sampling(network, found.bind, grid, sigmas, recipe.guidance)
+        graphs = {
+            name: Graph(f"{name}.onnx", engine.inputs, engine.outputs, f"{name}.npz")
+            for name, engine in engines.items()
+        }
         manifest = replace(manifest, graphs=graphs, parity=parity)
-        return write_bundle(out, manifest, {GRAPH: graph, PROBE: probe}, overwrite=overwrite)
+        return write_bundle(out, manifest, files, overwrite=overwrite)
 
 
-def convert(network: torch.nn.Module, path: Path, multiple: int) -> None:
-    """Write the network as one portable ONNX graph, optimised, with its weights inside.
+class Encode(torch.nn.Module):
+    """A network's features of photo and strokes, by name."""
 
-    Batch, rows and columns are free; sides are multiples of `multiple`. Raises ExportError.
+    outputs = Features._fields
+
+    def __init__(self, network: Mini) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, photo: torch.Tensor, light: torch.Tensor, mask: torch.Tensor) -> Features:
+        return self.network.encode(photo, light, mask)
+
+    def feeds(self, height: int, width: int, seed: int) -> Feeds:
+        feeds = random_feeds(height, width, seed)
+        return {name: feeds[name] for name in mini.SEEN}
+
+
+class Step(torch.nn.Module):
+    """A network's velocity, from its features."""
+
+    outputs = ("velocity",)
+
+    def __init__(self, network: Mini) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self,
+        x: torch.Tensor,
+        sigma: torch.Tensor,
+        mode: torch.Tensor,
+        given: torch.Tensor,
+        fine: torch.Tensor,
+        half: torch.Tensor,
+        quarter: torch.Tensor,
+        tokens: torch.Tensor,
+    ) -> torch.Tensor:
+        return self.network.step(x, sigma, mode, given, fine, half, quarter, tokens)
+
+    def feeds(self, height: int, width: int, seed: int) -> Feeds:
+        feeds = random_feeds(height, width, seed)
+        features = answers(Encode(self.network), {name: feeds[name] for name in mini.SEEN})
+        return {name: feeds[name] for name in ("x", "sigma", "mode")} | features
+
+
+def write_graph(
+    part: Encode | Step, name: str, folder: Path, multiple: int, weights: Weights
+) -> dict[str, Path]:
+    """Write one graph and its probe, a small evaluation and what torch answers; returns the two files."""
+    graph, probe = folder / f"{name}.onnx", folder / f"{name}.npz"
+    convert(part, graph, multiple)
+    if weights == "fp16":
+        store_as_half(graph)
+    feeds = part.feeds(2 * multiple, 3 * multiple, seed=1)
+    arrays: dict[str, Any] = {**feeds, **answers(part, feeds)}
+    np.savez(probe, **arrays)
+    return {graph.name: graph, probe.name: probe}
+
+
+def answers(part: Encode | Step, feeds: Feeds) -> dict[str, Array]:
+    """What torch computes, by the outputs' names; ExportError where it is not finite."""
+    with torch.inference_mode():
+        found = part(**{name: torch.from_numpy(array) for name, array in feeds.items()})
+    arrays = dict(zip(part.outputs, [found] if isinstance(found, torch.Tensor) else found, strict=True))
+    if not all(array.isfinite().all() for array in arrays.values()):
+        raise ExportError("The network computes what is no number; its weights are broken.")
+    return {output: array.numpy() for output, array in arrays.items()}
+
+
+def convert(part: Encode | Step, path: Path, multiple: int) -> None:
+    """Write a part of the network as one portable ONNX graph, optimised, with its weights inside.
+
+    Batch, rows and columns are free; the grid's sides are multiples of `multiple`. Raises ExportError.
     """
-    batch = Dim("batch", max=64)
-    planes = {0: batch, 2: multiple * Dim("rows", max=256), 3: multiple * Dim("columns", max=256)}
-    feeds = random_feeds(4 * multiple, 6 * multiple, seed=0)
-    shapes = {name: planes if array.ndim == 4 else {0: batch} for name, array in feeds.items()}
+    batch, rows, columns = Dim("batch", max=64), Dim("rows", max=256), Dim("columns", max=256)
+    feeds = part.feeds(4 * multiple, 6 * multiple, seed=0)
+
+    def shape(array: Array) -> dict[int, Any]:
+        """Free sides; a feature of 2 x 2 cells has half as many rows as the grid."""
+        if array.ndim < 4:
+            return {0: batch}
+        cells = array.shape[2] // 4
+        return {0: batch, 2: cells * rows, 3: cells * columns} if cells > 1 else {0: batch, 2: rows, 3: columns}
+
     with _quiet():
         try:
             program = torch.onnx.export(
-                network,
+                part,
                 kwargs={name: torch.from_numpy(array) for name, array in feeds.items()},
-                dynamic_shapes=shapes,
+                dynamic_shapes={name: shape(array) for name, array in feeds.items()},
                 input_names=list(feeds),
-                output_names=["velocity"],
+                output_names=list(part.outputs),
                 dynamo=True,
                 optimize=True,
                 verbose=False,
@@ -169,13 +248,6 @@ def store_as_half(path: Path) -> None:
     del model.graph.node[:]
     model.graph.node.extend(nodes)
     onnx.save(model, path)
-
-
-def save_probe(network: torch.nn.Module, path: Path, grid: GridRule) -> None:
-    """The bundle's self-test: one small evaluation, and what torch answers."""
-    feeds = random_feeds(2 * grid.multiple, 3 * grid.multiple, seed=1)
-    arrays: dict[str, Any] = {**feeds, "velocity": evaluate(network, feeds)}
-    np.savez(path, **arrays)
 
 
 def open_checked(graph: Path) -> Engine:

@@ -62,14 +62,21 @@ def step_flops(bundle: Bundle, size: tuple[int, int], guidance: float) -> int | 
     if grid is None:
         return None
     branches = 1 if guidance in (0, 1) else 2
-    raster = grid.shape(*size)
-    feeds = {}
-    for tensor in bundle.manifest.graphs["velocity"].inputs:
-        # (batch,) or (batch, channels, rows, columns); values do not change the count.
-        channels = [int(side) for side in tensor.shape[1:2]]
-        shape = (branches, *channels, *raster)[: len(tensor.shape)]
-        feeds[tensor.name] = np.ones(shape, tensor.dtype)
+    rows, columns = (side // grid.multiple for side in grid.shape(*size))
+    sides = {"batch": branches, "rows": rows, "columns": columns}
+    feeds = {
+        tensor.name: np.ones([_side(side, sides) for side in tensor.shape], tensor.dtype)
+        for tensor in bundle.manifest.graphs["velocity"].inputs  # values do not change the count
+    }
     return graph_flops(bundle.path("velocity"), feeds)
+
+
+def _side(side: int | str, known: Mapping[str, int]) -> int:
+    """The length of a side such as 3, "rows" or "4*rows"."""
+    if isinstance(side, int):
+        return side
+    factor, _, name = side.rpartition("*")
+    return int(factor or 1) * known[name]
 
 
 def _shapes(described: Sequence[Mapping[str, Any]]) -> list[Shape]:

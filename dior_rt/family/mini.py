@@ -6,7 +6,7 @@ and photo are sRGB-encoded and encode(L) = log(1 + 8 L) / log 9: in both, square
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,7 @@ from dior_rt.schedule import ShiftSchedule
 MODES: Final[dict[Mode, int]] = {"relight": 0, "estimate": 1}
 RELIT_SCALE: Final = np.float32(4)
 LUMI_SCALE: Final = np.float32(8)
+SEEN: Final = ("photo", "light", "mask")  # what the graph "encode" looks at
 
 
 class Mini:
@@ -33,8 +34,9 @@ class Mini:
         if bundle.manifest.family != "mini" or grid is None or not isinstance(schedule, ShiftSchedule):
             raise BundleError(f"{bundle.folder} is no complete bundle of the family mini.")
         self._grid, self._schedule = grid, schedule
-        self._engine = open_engine(bundle, "velocity", device, threads)
-        self.device, self.reason = self._engine.device, self._engine.reason
+        velocity = open_engine(bundle, "velocity", device, threads)
+        self._graphs = Graphs(open_engine(bundle, "encode", velocity.device, threads), velocity)
+        self.device, self.reason = velocity.device, velocity.reason
 
     def raster(self, height: int, width: int) -> tuple[int, int]:
         return self._grid.shape(height, width)
@@ -49,7 +51,7 @@ class Mini:
         return self._schedule.sigmas(steps)
 
     def velocity(self, condition: Condition, sigmas: Array, guidance: float) -> Velocity:
-        return guided(partial(bind, self._engine), condition, null(condition), guidance)
+        return guided(self._graphs.bind, condition, null(condition), guidance)
 
     def decode_relit(self, x0: Array, condition: Condition) -> Array:
         return _pixels(np.clip(condition["photo"] + x0 / RELIT_SCALE, 0, 1))
@@ -76,14 +78,22 @@ def null(condition: Condition) -> Condition:
     return {**condition, **{name: np.zeros_like(condition[name]) for name in ("light", "mask")}}
 
 
-def bind(engine: Engine, condition: Condition) -> Velocity:
-    """The velocity of mini's graph under a condition, whose arrays go to the device once."""
-    binding = engine.bind(condition)
+@dataclass(frozen=True)
+class Graphs:
+    """Mini's two graphs. encode: what photo and strokes say, run once; velocity: run at every step."""
 
-    def velocity(x: Array, sigma: float) -> Array:
-        return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
+    encode: Engine
+    velocity: Engine
 
-    return velocity
+    def bind(self, condition: Condition) -> Velocity:
+        """The velocity under a condition, whose features are computed and go to the device once."""
+        features = self.encode.run({name: condition[name] for name in SEEN})
+        binding = self.velocity.bind({"mode": condition["mode"], **features})
+
+        def velocity(x: Array, sigma: float) -> Array:
+            return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
+
+        return velocity
 
 
 def _planes(pixels: Array) -> Array:

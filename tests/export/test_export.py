@@ -23,16 +23,30 @@ from dior_rt.export.check import (
     evaluate,
     random_feeds,
     relative_error,
+    run,
 )
-from dior_rt.export.mini import export_checkpoint, export_network, open_checked, round_to_half, store_as_half
+from dior_rt.export.mini import (
+    Encode,
+    Step,
+    answers,
+    export_checkpoint,
+    export_network,
+    open_checked,
+    round_to_half,
+    store_as_half,
+)
 from dior_rt.family import mini
 from dior_rt.schedule import ShiftSchedule
-from dior_rt.training.network import save_network
+from dior_rt.training.network import Mini, save_network
 
 
-@pytest.fixture(scope="module")
-def graph(exported):
-    return onnx.load(exported.path("velocity"))
+@pytest.fixture(scope="module", params=["encode", "velocity"])
+def graph(request, exported):
+    return onnx.load(exported.path(request.param))
+
+
+def open_graphs(bundle) -> mini.Graphs:
+    return mini.Graphs(open_engine(bundle, "encode", "cpu"), open_engine(bundle, "velocity", "cpu"))
 
 
 @pytest.fixture
@@ -55,9 +69,14 @@ def test_the_manifest_says_how_to_run_it_and_how_well_it_was_met(exported, recip
 @pytest.mark.parametrize("size", [(4, 4), (4, 8), (64, 64), (52, 80), (4, 256), (256, 4)])
 @pytest.mark.parametrize("batch", [1, 2, 10])
 def test_every_size_and_batch_agrees_with_torch(exported, rounded, size, batch):
-    engine = open_engine(exported, "velocity", "cpu")
     feeds = {name: array[:batch] for name, array in random_feeds(*size, seed=9).items()}
-    assert relative_error(engine.run(feeds)["velocity"], evaluate(rounded, feeds)) < 1e-5
+    assert relative_error(run(open_graphs(exported), feeds), evaluate(rounded, feeds)) < 1e-5
+
+
+def test_what_does_not_depend_on_the_flow_is_no_part_of_a_step(exported):
+    taken = {name: {t.name for t in graph.inputs} for name, graph in exported.manifest.graphs.items()}
+    assert taken["encode"] == set(mini.SEEN)
+    assert taken["velocity"].isdisjoint(mini.SEEN) and {"x", "sigma"} < taken["velocity"]
 
 
 def test_the_graph_is_portable_and_says_nothing_of_where_it_was_made(graph):
@@ -68,8 +87,9 @@ def test_the_graph_is_portable_and_says_nothing_of_where_it_was_made(graph):
     assert b".py" not in text and b"site-packages" not in text
 
 
-def test_weights_are_stored_in_half_the_space(graph, network):
-    stored = sum(len(tensor.raw_data) for tensor in graph.graph.initializer)
+def test_weights_are_stored_in_half_the_space(exported, network):
+    graphs = [onnx.load(exported.path(name)).graph for name in exported.manifest.graphs]
+    stored = sum(len(tensor.raw_data) for graph in graphs for tensor in graph.initializer)
     assert stored < 0.6 * sum(weight.numel() * 4 for weight in network.parameters())
 
 
@@ -112,12 +132,15 @@ def test_rounding_to_half_reports_its_cost(network, recipe):
     assert round_to_half(network, recipe.grid) == 0
 
 
-def test_the_probe_is_what_torch_answers(exported, rounded):
-    with np.load(exported.folder / "probe.npz", allow_pickle=False) as probe:
+@pytest.mark.parametrize("name, part", [("encode", Encode), ("velocity", Step)])
+def test_the_probe_is_what_torch_answers(exported, rounded, name, part):
+    graph = exported.manifest.graphs[name]
+    with np.load(exported.folder / graph.probe, allow_pickle=False) as probe:
         arrays = dict(probe)
-    np.testing.assert_allclose(
-        evaluate(rounded, {k: arrays[k] for k in arrays if k != "velocity"}), arrays["velocity"]
-    )
+    found = answers(part(rounded), {tensor.name: arrays.pop(tensor.name) for tensor in graph.inputs})
+    assert found.keys() == arrays.keys() == {tensor.name for tensor in graph.outputs}
+    for output, array in found.items():
+        np.testing.assert_allclose(array, arrays[output], rtol=1e-6, atol=1e-6)
 
 
 def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
@@ -129,8 +152,7 @@ def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
     assert bundle.manifest.precision == "fp32" and "weights_as_fp16" not in bundle.manifest.parity
     assert bundle.manifest.grid == dataclasses.replace(recipe.grid, multiple=network.config.patch)
     feeds = random_feeds(8, 12, seed=3)
-    got = Engine(bundle.path("velocity")).run(feeds)["velocity"]
-    assert relative_error(got, evaluate(adapted.eval(), feeds)) < 1e-5
+    assert relative_error(run(open_graphs(bundle), feeds), evaluate(adapted.eval(), feeds)) < 1e-5
 
 
 def spoiled(network, by):
@@ -142,15 +164,14 @@ def spoiled(network, by):
 
 
 def test_a_graph_that_differs_fails_in_one_evaluation(exported, rounded, recipe):
-    engine = open_engine(exported, "velocity", "cpu")
-    assert check_evaluations(rounded, engine, recipe.grid) < 1e-5
+    graphs = open_graphs(exported)
+    assert check_evaluations(rounded, graphs, recipe.grid) < 1e-5
     with pytest.raises(ExportError, match="off by"):
-        check_evaluations(spoiled(rounded, by=0.01), engine, recipe.grid)
+        check_evaluations(spoiled(rounded, by=0.01), graphs, recipe.grid)
 
 
 def test_a_graph_that_differs_fails_after_all_steps(exported, rounded, recipe):
-    engine = open_engine(exported, "velocity", "cpu")
-    bind, sigmas = (lambda condition: mini.bind(engine, condition)), ShiftSchedule(8.0).sigmas(4)
+    bind, sigmas = open_graphs(exported).bind, ShiftSchedule(8.0).sigmas(4)
     assert check_sampling(rounded, bind, recipe.grid, sigmas, 2.0) > 100
     with pytest.raises(ExportError, match="dB"):
         check_sampling(spoiled(rounded, by=0.2), bind, recipe.grid, sigmas, 2.0)
@@ -158,7 +179,9 @@ def test_a_graph_that_differs_fails_after_all_steps(exported, rounded, recipe):
 
 def test_an_export_over_the_bar_leaves_nothing_behind(exported, network, recipe, tmp_path, monkeypatch):
     # The graph of other weights stands in for one that was converted wrongly.
-    monkeypatch.setattr(export, "convert", lambda _, path, __: shutil.copy(exported.path("velocity"), path))
+    monkeypatch.setattr(
+        export, "convert", lambda _, path, __: shutil.copy(exported.folder / path.name, path)
+    )
     with pytest.raises(ExportError, match="off by"):
         export_network(spoiled(network, by=0.01), recipe, tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
@@ -197,13 +220,13 @@ def test_what_is_no_checkpoint_is_refused(network, tmp_path, damage):
     assert not (tmp_path / "b").exists()
 
 
-def test_a_network_that_is_no_graph_is_refused(recipe, tmp_path):
-    class Undecided(torch.nn.Module):
-        def forward(self, x, sigma, photo, light, mask, mode):
+def test_a_network_that_is_no_graph_is_refused(network, recipe, tmp_path):
+    class Undecided(Mini):
+        def step(self, x, *rest):
             return x if float(x.sum()) > 0 else -x
 
     with pytest.raises(ExportError, match="ONNX"):
-        export_network(Undecided(), recipe, tmp_path / "b")
+        export_network(Undecided(network.config), recipe, tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
 
 

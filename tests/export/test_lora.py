@@ -36,7 +36,7 @@ def folder(adapted, tmp_path):
 def test_merged_equals_unmerged(network, adapted, folder):
     base, want = evaluate(network, FEEDS), evaluate(adapted, FEEDS)
     merged = merge_lora(network, folder)
-    assert relative_error(base, want) > 1e-2
+    assert relative_error(base, want) > 1e-3
     assert relative_error(evaluate(merged, FEEDS), want) < 1e-5
     assert not any("lora" in name for name, _ in merged.named_parameters())
 

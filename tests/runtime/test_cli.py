@@ -306,12 +306,12 @@ def test_a_tampered_bundle_is_refused(refuses, folder: Path, mini_bundle: Path) 
     import shutil
 
     shutil.copytree(mini_bundle, folder / "bundle")
-    graph = folder / "bundle" / "model.onnx"
+    graph = folder / "bundle" / "velocity.onnx"
     data = bytearray(graph.read_bytes())
     data[len(data) // 2] ^= 1
     graph.write_bytes(data)
-    refuses("relight", "photo.png", "strokes.png", "--bundle", "bundle", words="model.onnx")
-    refuses("info", "bundle", words="model.onnx")
+    refuses("relight", "photo.png", "strokes.png", "--bundle", "bundle", words="velocity.onnx")
+    refuses("info", "bundle", words="velocity.onnx")
 
 
 def test_debug_shows_where_it_happened(folder: Path, capfd) -> None:

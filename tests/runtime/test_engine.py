@@ -96,7 +96,7 @@ def test_a_missing_input_is_refused(scaled_sum):
 
 def test_sides_must_be_multiples_where_the_graph_says_so(mini_bundle):
     engine = open_engine(read_bundle(mini_bundle), "velocity", "cpu")
-    with np.load(mini_bundle / "probe.npz") as probe:
+    with np.load(mini_bundle / "velocity.npz") as probe:
         given = {tensor.name: probe[tensor.name] for tensor in engine.inputs}
     cut = {name: array[..., :-1] if array.ndim == 4 else array for name, array in given.items()}
     with pytest.raises(InputError, match=r"\d\*columns"):
@@ -145,7 +145,7 @@ def test_a_thread_count_below_one_is_refused(scaled_sum, threads):
 def test_threads_do_not_change_the_result(mini_bundle):
     bundle = read_bundle(mini_bundle)
     one, two = (open_engine(bundle, "velocity", "cpu", threads=n) for n in (1, 2))
-    with np.load(mini_bundle / "probe.npz") as probe:
+    with np.load(mini_bundle / "velocity.npz") as probe:
         given = {tensor.name: probe[tensor.name] for tensor in one.inputs}
     np.testing.assert_allclose(one.run(given)["velocity"], two.run(given)["velocity"], rtol=1e-4, atol=1e-4)
 
@@ -181,14 +181,14 @@ def test_auto_passes_over_an_accelerator_that_cannot_start(mini_bundle, monkeypa
 
 def test_a_device_that_computes_something_else_is_refused(mini_bundle, tmp_path):
     bundle = read_bundle(mini_bundle)
-    with np.load(mini_bundle / "probe.npz") as probe:
+    with np.load(mini_bundle / "velocity.npz") as probe:
         arrays = dict(probe)
     arrays["velocity"] = arrays["velocity"] * 1.01
-    np.savez(tmp_path / "probe.npz", **arrays)
+    np.savez(tmp_path / "velocity.npz", **arrays)
     wrong = write_bundle(
         tmp_path / "wrong",
         bundle.manifest,
-        {"model.onnx": mini_bundle / "model.onnx", "probe.npz": tmp_path / "probe.npz"},
+        {"model.onnx": mini_bundle / "model.onnx", "velocity.npz": tmp_path / "probe.npz"},
     )
     for device in ("cpu", "auto"):
         with pytest.raises(DeviceError, match="wrong results"):
@@ -198,7 +198,7 @@ def test_a_device_that_computes_something_else_is_refused(mini_bundle, tmp_path)
 def test_a_graph_with_other_tensors_than_promised_is_refused(mini_bundle, tmp_path, scaled_sum):
     manifest = read_bundle(mini_bundle).manifest
     other = write_bundle(
-        tmp_path / "other", manifest, {"model.onnx": scaled_sum, "probe.npz": mini_bundle / "probe.npz"}
+        tmp_path / "other", manifest, {"model.onnx": scaled_sum, "velocity.npz": mini_bundle / "probe.npz"}
     )
     with pytest.raises(BundleError, match="other tensors"):
         open_engine(other, "velocity", "cpu")
@@ -206,14 +206,14 @@ def test_a_graph_with_other_tensors_than_promised_is_refused(mini_bundle, tmp_pa
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", "lacks"])
 def test_a_probe_that_cannot_be_read_is_refused(mini_bundle, tmp_path, content):
-    probe = tmp_path / "probe.npz"
+    probe = tmp_path / "velocity.npz"
     if content == "lacks":
         np.savez(probe, x=np.zeros(1))
     else:
         probe.write_bytes(content)
     manifest = read_bundle(mini_bundle).manifest
     bad = write_bundle(
-        tmp_path / "bad", manifest, {"model.onnx": mini_bundle / "model.onnx", "probe.npz": probe}
+        tmp_path / "bad", manifest, {"model.onnx": mini_bundle / "model.onnx", "velocity.npz": probe}
     )
     with pytest.raises(BundleError, match="self-test"):
         open_engine(bad, "velocity", "cpu")
