@@ -193,13 +193,15 @@ def test_operations_of_nodes() -> None:
 def test_operations_of_a_network_counted_by_hand(mini_bundle: Path, guidance: float, branches: int) -> None:
     network = load_network(CHECKPOINT).config
     rows, columns = read_bundle(mini_bundle).manifest.grid.shape(100, 150)
-    area = network.patch**2
-    cells, tokens, width, features = rows * columns, rows * columns // area, network.width, network.features
-    once = width * width * 2 + width * 6 * width  # time, modulation
+    cells, width, patch = rows * columns, network.width, network.patch
+    fine, half, quarter = network.fine, network.half, network.quarter
+    tokens = cells // patch**2
+    once = width * width * 2 + width * 6 * width + width * fine  # time, modulation, the state's gate
     block = tokens * width * (3 * width + width + 8 * width) + 2 * tokens * tokens * width
-    ends = tokens * width * (10 + features) * area  # embed, unembed
-    convolutions = cells * 9 * features * (features + 10 + 6)  # smooth, head
-    wanted = 2 * branches * (once + network.depth * block + ends + convolutions)
+    ends = tokens * width * (3 * patch**2 + quarter * (patch // 4) ** 2)  # the state's tokens, unembed
+    blends = cells // 16 * quarter * (9 * quarter + 4 * half) + cells // 4 * half * (9 * half + 4 * fine)
+    convolutions = cells * 9 * fine * (3 + fine + 9)  # the state, smooth, head
+    wanted = 2 * branches * (once + network.depth * block + ends + blends + convolutions)
     assert step_flops(read_bundle(mini_bundle), (100, 150), guidance) == wanted
 
 

@@ -20,9 +20,12 @@ import twin
 
 from dior_rt import Relighter
 from dior_rt.bundle import Bundle, default_bundle, read_bundle, write_bundle
-from dior_rt.family.mini import Mini
+from dior_rt.engine import Engine
+from dior_rt.export.check import run
+from dior_rt.family.mini import SEEN, Graphs, Mini
 from dior_rt.grid import GridRule
 
+INPUTS = ("x", "sigma", "mode", *SEEN)
 NOTES = pytest.StashKey[ledger.Ledger]()
 
 
@@ -54,11 +57,14 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Bundle]:
 
     @cache
     def lowered(precision: str) -> Bundle:
-        graph = precisions.lower(shipped.path("velocity"), precision, folder / f"{precision}.onnx")
-        tensors = dataclasses.replace(shipped.manifest.graphs["velocity"], file="model.onnx", probe=None)
-        changes = {"grid": grid, "precision": precision, "graphs": {"velocity": tensors}, "noise_scale": 1.0}
+        files, graphs = {}, {}
+        for name, graph in shipped.manifest.graphs.items():
+            lower = folder / f"{name}-{precision}.onnx"
+            files[graph.file] = precisions.lower(shipped.path(name), precision, lower)
+            graphs[name] = dataclasses.replace(graph, probe=None)
+        changes = {"grid": grid, "precision": precision, "graphs": graphs, "noise_scale": 1.0}
         manifest = dataclasses.replace(shipped.manifest, **changes)
-        return write_bundle(folder / precision, manifest, {"model.onnx": graph})
+        return write_bundle(folder / precision, manifest, files)
 
     return lowered
 
@@ -77,13 +83,26 @@ def family(bundle) -> Mini:
 @pytest.fixture(scope="session")
 def network(bundle) -> twin.Network:
     """The shipped model in float64."""
-    return twin.Network(bundle("fp32").path("velocity"))
+    return twin.Network(bundle("fp32"))
+
+
+@pytest.fixture(scope="session")
+def velocity(bundle) -> Callable[..., np.ndarray]:
+    """`velocity(feeds, precision, threads)`: one evaluation of the shipped network."""
+
+    @cache
+    def graphs(precision: str, threads: int) -> Graphs:
+        paths = (bundle(precision).path(name) for name in ("encode", "velocity"))
+        return Graphs(*(Engine(path, threads=threads) for path in paths))
+
+    return lambda feeds, precision, threads=1: run(graphs(precision, threads), feeds)
 
 
 @pytest.fixture(scope="session")
 def usual_feeds() -> dict[str, np.ndarray]:
-    """Inputs of the shipped graph, of both modes and several sigmas: the bundle's own self-test."""
-    shipped = read_bundle(default_bundle())
-    graph = shipped.manifest.graphs["velocity"]
-    with np.load(shipped.folder / graph.probe) as probe:
-        return {tensor.name: probe[tensor.name] for tensor in graph.inputs}
+    """Inputs of an evaluation, of both modes and several sigmas: the bundle's own self-test."""
+    shipped, feeds = read_bundle(default_bundle()), {}
+    for graph in shipped.manifest.graphs.values():
+        with np.load(shipped.folder / graph.probe) as probe:
+            feeds |= {name: probe[name] for name in INPUTS if name in probe}
+    return feeds

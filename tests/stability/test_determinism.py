@@ -45,19 +45,17 @@ def test_same_bytes_for_any_number_of_threads(bundle, hold, precision):
 
 
 @pytest.mark.parametrize(("precision", "alone"), [("fp32", 2e-6), ("fp16", 1e-2), ("int8", 1e-1)])
-def test_velocity_in_a_batch_and_alone(bundle, usual_feeds, hold, precision, alone):
+def test_velocity_in_a_batch_and_alone(velocity, usual_feeds, hold, precision, alone):
     """ONNX Runtime cuts a convolution into sums by its threads and its batch: the last bits may differ. In
     int8 the range of a whole batch decides how its activations are rounded."""
-    path = bundle(precision).path("velocity")
     feeds = {name: array[[0, 3, 5]] for name, array in usual_feeds.items()}
     rows = [{name: array[i : i + 1] for name, array in feeds.items()} for i in range(3)]
-    want = Engine(path, threads=1).run(feeds)["velocity"]
+    want = velocity(feeds, precision)
     scale = np.abs(want).max((1, 2, 3), keepdims=True)
     for threads in THREADS:
-        engine = Engine(path, threads=threads)
-        got = engine.run(feeds)["velocity"]
+        got = velocity(feeds, precision, threads)
         hold("velocity, 1 to 5 threads", precision, got, want, 2e-6, "largest value", scale)
-        got = np.concatenate([engine.run(row)["velocity"] for row in rows])
+        got = np.concatenate([velocity(row, precision, threads) for row in rows])
         hold("velocity, row by row", precision, got, want, alone, "largest value", scale)
 
 

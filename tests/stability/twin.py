@@ -18,6 +18,7 @@ from onnx import TensorProto, numpy_helper
 from onnx.reference import ReferenceEvaluator
 from onnx.reference.op_run import OpRun
 
+from dior_rt.bundle import Bundle
 from dior_rt.family import Family
 from dior_rt.family.mini import null
 from dior_rt.kernels import Strokes
@@ -135,7 +136,7 @@ def shift_sigmas(shift: float, steps: int) -> Array:
     return shift * u / (1 + (shift - 1) * u)
 
 
-class Network:
+class Graph:
     """An exported graph as ONNX's reference evaluator computes it, with every float a float64."""
 
     def __init__(self, path: Path) -> None:
@@ -151,6 +152,17 @@ class Network:
         with np.errstate(over="ignore", invalid="ignore"):  # of its sigmoid, in the branch that is not taken
             return dict(zip(self._evaluator.output_names, self._evaluator.run(None, wide), strict=True))
 
+
+class Network:
+    """Mini's two graphs in float64."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._encode, self._velocity = Graph(bundle.path("encode")), Graph(bundle.path("velocity"))
+
+    def run(self, feeds: Mapping[str, NDArray]) -> Array:
+        """The velocity for the inputs of one evaluation."""
+        return self._velocity.run({**feeds, **self._encode.run(feeds)})["velocity"]
+
     def velocity(self, condition: Mapping[str, NDArray], guidance: float) -> Velocity:
         """v_null + guidance (v_cond - v_null) of mini's graph."""
         without = null(condition)
@@ -158,7 +170,7 @@ class Network:
 
         def velocity(x: Array, sigma: float) -> Array:
             feeds = {"x": np.concatenate([x, x]), "sigma": np.full(2, sigma), **both}
-            v_null, v_cond = np.split(self.run(feeds)["velocity"], 2)
+            v_null, v_cond = np.split(self.run(feeds), 2)
             return v_null + guidance * (v_cond - v_null)
 
         return velocity
