@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, cast
+from typing import Final, TypeVar, cast
 
 import torch
 from peft import PeftConfig, PeftModel, set_peft_model_state_dict
@@ -13,11 +13,13 @@ from safetensors.torch import load_file
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, reason
 
+Network = TypeVar("Network", bound=torch.nn.Module)
+
 CONFIG: Final = "adapter_config.json"
 WEIGHTS: Final = "adapter_model.safetensors"
 
 
-def merge_lora(network: torch.nn.Module, folder: Path) -> torch.nn.Module:
+def merge_lora(network: Network, folder: Path) -> Network:
     """The network with peft's adapter in `folder` (adapter_config.json, adapter_model.safetensors) merged in.
 
     Raises InputError for an adapter that is missing, cut short, or made for another network.
@@ -31,6 +33,6 @@ def merge_lora(network: torch.nn.Module, folder: Path) -> torch.nn.Module:
         strange = [*unexpected, *(key for key in missing if "lora_" in key)]
         if strange:
             raise ValueError(f"the network and the adapter differ in {strange[0]}")
-        return adapted.merge_and_unload(safe_merge=True)
+        return cast(Network, adapted.merge_and_unload(safe_merge=True))
     except (OSError, SafetensorError, ValueError, RuntimeError, TypeError, KeyError) as error:
         raise InputError(f"The LoRA in {folder} cannot be merged: {reason(error)}.") from error

@@ -99,8 +99,8 @@ def export_network(
     network = network.eval()
     parity = {"weights_as_fp16": round_to_half(network, grid)} if weights == "fp16" else {}
     with tempfile.TemporaryDirectory() as scratch:
-        parts = {"encode": Encode(network), "velocity": Step(network)}
-        files = {}
+        parts: dict[str, Encode | Step] = {"encode": Encode(network), "velocity": Step(network)}
+        files: dict[str, Path] = {}
         for name, part in parts.items():
             files |= write_graph(part, name, Path(scratch), grid.multiple, weights)
         engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
@@ -198,7 +198,8 @@ def convert(part: Encode | Step, path: Path, multiple: int) -> None:
         if array.ndim < 4:
             return {0: batch}
         cells = array.shape[2] // 4
-        return {0: batch, 2: cells * rows, 3: cells * columns} if cells > 1 else {0: batch, 2: rows, 3: columns}
+        down, along = (cells * rows, cells * columns) if cells > 1 else (rows, columns)
+        return {0: batch, 2: down, 3: along}
 
     with _quiet():
         try:

@@ -1,12 +1,16 @@
-"""Mini's network: a plain diffusion transformer on the light grid that predicts light, not colours.
+"""Mini's network: a diffusion transformer on the light grid that predicts light, not colours.
 
-Its heads are physical. To relight it predicts a log-ratio r of light a cell and channel,
+Convolutions see photo and strokes, a plain DiT works on tokens of 8 x 8 cells, and convolutions blend its
+answer across the tokens' borders. The heads are physical. To relight, a log-ratio r a cell and channel,
 
     relit = (photo + e) exp(r) - e        in linear light, e = 0.02
 
-so a network that has learnt nothing returns the photo, and black can still be lit. To estimate it predicts
-the encoded Lumi map as a change of the encoded photo. Both are what x0 is expected to be; the velocity is
-that of a narrow Gaussian about it.
+    r = raw + log((drawn + b) / (own + b))    under a stroke, b = 0.05: the light that has bounced
+    r = raw + what strokes say elsewhere      beside strokes, as far as learnt gates let it reach
+
+so a network that has learnt nothing returns the photo where nothing is drawn, black can still be lit, and
+twice the drawn value is twice the light. `own`, the photo's own Lumi map, is the answer to estimate. The
+velocity is that of a narrow Gaussian about the answer.
 """
 
 from __future__ import annotations
@@ -33,16 +37,16 @@ LORA = "lora"
 FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
 RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
-BOUNCED = 0.05  # b: light that reaches a place where no source shines, so that drawn darkness is no black hole
+BOUNCED = 0.05  # light where no source shines: it has bounced there, and drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
 CLOSED = 2.0  # gates begin an eighth open
-SPREAD = 0.5  # of x0 about what the network expects: some 0.12 in sRGB
+DEVIATION = 0.5  # of x0 from what the network expects: some 0.12 in sRGB
 
 
 @dataclass(frozen=True)
 class Config:
-    """The network's size. width: of a token, a multiple of 4 heads; patch: a token's side, in cells, a multiple
-    of 4; fine, half, quarter: features of a cell, of 2 x 2, and of 4 x 4 cells.
+    """The network's size. width: of a token, a multiple of 4 heads; patch: a token's side, in cells, a
+    multiple of 4; fine, half, quarter: features of a cell, of 2 x 2, and of 4 x 4 cells.
 
     Raises InputError for a width that the heads do not divide so, and for such a patch.
     """
@@ -105,17 +109,17 @@ def _means(sums: Tensor) -> Tensor:
 
 
 def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
-    """E[eps - x0 | x] where x = (1 - sigma) x0 + sigma eps and x0 is Gaussian about `expected` with std SPREAD.
+    """E[eps - x0 | x] where x = (1 - sigma) x0 + sigma eps, and x0 is Gaussian about `expected`.
 
     So the answer rests on `expected` near noise and on the state near the image, and no sigma is divided by.
     """
-    variance = SPREAD**2
-    return ((sigma - (1 - sigma) * variance) * x - sigma * expected) / ((1 - sigma) ** 2 * variance + sigma**2)
+    rest, variance = 1 - sigma, DEVIATION**2
+    return ((sigma - rest * variance) * x - sigma * expected) / (rest**2 * variance + sigma**2)
 
 
 class Features(NamedTuple):
-    """What does not depend on the flow. given: photo, photo in linear light, its light if it were white paper
-    (encoded), the log of the drawn light, mask; then what convolutions see in cells, 2 x 2, and 4 x 4 cells."""
+    """What does not depend on the flow. given: photo, photo in linear light, its light if it were white
+    paper (encoded), the log of the drawn light, mask; the others are what convolutions see."""
 
     given: Tensor  # (B, 13, h, w)
     fine: Tensor  # (B, 16, h, w)
@@ -203,8 +207,8 @@ class Mini(nn.Module):
         return velocity(x, sigma[:, None, None, None], expected)
 
     def _reach(self, drawn: Tensor, mask: Tensor, gates: Tensor) -> Tensor:
-        """How the light of the strokes goes on beside them: gates say how much of what is drawn nearby, farther
-        off, and everywhere holds for a cell."""
+        """How the light of the strokes goes on beside them: gates say how much of what is drawn nearby,
+        farther off, and everywhere holds for a cell."""
         drawn, patch = torch.cat([drawn, mask], dim=1), self.config.patch
         near, far, everywhere = torch.sigmoid(gates - CLOSED).split(1, dim=1)
         light = near * spread(drawn, patch // 2) + far * spread(drawn, patch)

@@ -179,9 +179,7 @@ def test_a_graph_that_differs_fails_after_all_steps(exported, rounded, recipe):
 
 def test_an_export_over_the_bar_leaves_nothing_behind(exported, network, recipe, tmp_path, monkeypatch):
     # The graph of other weights stands in for one that was converted wrongly.
-    monkeypatch.setattr(
-        export, "convert", lambda _, path, __: shutil.copy(exported.folder / path.name, path)
-    )
+    monkeypatch.setattr(export, "convert", lambda _, path, __: shutil.copy(exported.folder / path.name, path))
     with pytest.raises(ExportError, match="off by"):
         export_network(spoiled(network, by=0.01), recipe, tmp_path / "b")
     assert list(tmp_path.iterdir()) == []

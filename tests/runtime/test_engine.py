@@ -1,6 +1,7 @@
 """The engine: its door, its self-test, its threads, its errors."""
 
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -9,7 +10,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from dior_rt import providers
-from dior_rt.bundle import read_bundle, write_bundle
+from dior_rt.bundle import Bundle, read_bundle, write_bundle
 from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError, DeviceError, InputError
 from dior_rt.providers import PROVIDERS, available
@@ -179,27 +180,26 @@ def test_auto_passes_over_an_accelerator_that_cannot_start(mini_bundle, monkeypa
         open_engine(read_bundle(mini_bundle), "velocity", missing)
 
 
+def altered(bundle: Bundle, files: dict[str, Path], folder: Path) -> Bundle:
+    """The bundle with other files in the place of some."""
+    own = {name: bundle.folder / name for name in bundle.manifest.files}
+    return write_bundle(folder, bundle.manifest, own | files)
+
+
 def test_a_device_that_computes_something_else_is_refused(mini_bundle, tmp_path):
     bundle = read_bundle(mini_bundle)
     with np.load(mini_bundle / "velocity.npz") as probe:
         arrays = dict(probe)
     arrays["velocity"] = arrays["velocity"] * 1.01
     np.savez(tmp_path / "velocity.npz", **arrays)
-    wrong = write_bundle(
-        tmp_path / "wrong",
-        bundle.manifest,
-        {"model.onnx": mini_bundle / "model.onnx", "velocity.npz": tmp_path / "probe.npz"},
-    )
+    wrong = altered(bundle, {"velocity.npz": tmp_path / "velocity.npz"}, tmp_path / "wrong")
     for device in ("cpu", "auto"):
         with pytest.raises(DeviceError, match="wrong results"):
             open_engine(wrong, "velocity", device)
 
 
 def test_a_graph_with_other_tensors_than_promised_is_refused(mini_bundle, tmp_path, scaled_sum):
-    manifest = read_bundle(mini_bundle).manifest
-    other = write_bundle(
-        tmp_path / "other", manifest, {"model.onnx": scaled_sum, "velocity.npz": mini_bundle / "probe.npz"}
-    )
+    other = altered(read_bundle(mini_bundle), {"velocity.onnx": scaled_sum}, tmp_path / "other")
     with pytest.raises(BundleError, match="other tensors"):
         open_engine(other, "velocity", "cpu")
 
@@ -211,10 +211,7 @@ def test_a_probe_that_cannot_be_read_is_refused(mini_bundle, tmp_path, content):
         np.savez(probe, x=np.zeros(1))
     else:
         probe.write_bytes(content)
-    manifest = read_bundle(mini_bundle).manifest
-    bad = write_bundle(
-        tmp_path / "bad", manifest, {"model.onnx": mini_bundle / "model.onnx", "velocity.npz": probe}
-    )
+    bad = altered(read_bundle(mini_bundle), {"velocity.npz": probe}, tmp_path / "bad")
     with pytest.raises(BundleError, match="self-test"):
         open_engine(bad, "velocity", "cpu")
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from dior_rt import Relighter
-from dior_rt.engine import Engine
 from dior_rt.kernels import Strokes
 
 THREADS = (1, 2, 3, 5)
