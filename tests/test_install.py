@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -106,6 +107,15 @@ def test_the_main_job_in_a_fresh_environment_without_torch(installed: Path, tmp_
         assert json.loads(relit.text["Dior"]) == report["settings"]  # type: ignore[attr-defined]
     assert np.abs(after - before).mean() > 1
     assert after.std() > 10  # a picture, and not one colour
+
+
+@pytest.mark.skipif(
+    (platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="PoCL has a wheel for Linux alone"
+)
+def test_the_kernels_run_by_opencl_out_of_the_box(installed: Path, tmp_path: Path) -> None:
+    code = "from dior_rt.kernels import open_ops; print(open_ops('auto').name)"
+    result = run(installed / "python", "-c", code, cwd=tmp_path)
+    assert result.stdout.startswith("opencl:"), result.stderr
 
 
 def test_no_part_is_importable_by_its_bare_name(installed: Path, tmp_path: Path) -> None:
