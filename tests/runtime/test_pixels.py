@@ -14,7 +14,7 @@ RGBA = np.random.default_rng(1).integers(0, 256, (5, 7, 4), dtype=np.uint8)
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_arrays_pass_as_they_are(dtype):
-    pixels = RGB.astype(dtype)
+    pixels = (RGB / 255 if dtype == np.float32 else RGB).astype(dtype)
     assert read_pixels(pixels) is pixels
     assert like_photo(pixels, pixels) is pixels
 

@@ -246,7 +246,7 @@ WRONG_JSON: list[tuple[Any, str]] = [
     ([{**STROKE, "points": [[1, 2, 3]]}], "each point"),
     ([{**STROKE, "points": [["1", 2]]}], "numbers"),
     ([{**STROKE, "points": [[True, 2]]}], "numbers"),
-    ('[{"points": [[1e999, 2]], "width": 3}]', "finite"),
+    ('[{"points": [[1e999, 2]], "width": 3}]', "within"),
     ([{**STROKE, "width": 0}], "width"),
     ([{**STROKE, "width": -3}], "width"),
     ([{**STROKE, "color": "red"}], "#rrggbb"),
