@@ -224,6 +224,8 @@ def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor
     Raises InputError where the folder has no text encoder.
     """
     try:
+        if not (folder / "tokenizer").is_dir():  # transformers would take its name for one of the net's
+            raise FileNotFoundError(f"there is no folder {folder / 'tokenizer'}")
         tokenizer = Qwen2Tokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
         encoder = Qwen2_5_VLForConditionalGeneration.from_pretrained(folder / "text_encoder", **LOCAL)
     except (OSError, ValueError, RuntimeError) as error:

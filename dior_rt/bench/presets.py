@@ -90,4 +90,5 @@ if __name__ == "__main__":
     try:
         typer.run(main)
     except DiorError as error:
-        sys.exit(f"dior-rt: {error}")
+        typer.echo(f"dior-rt: {error}", err=True)
+        sys.exit(2)  # 1 is a broken promise

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -137,3 +139,9 @@ def test_presets_are_slower_than_the_reference_in_no_shipped_model() -> None:
     presets, own = read_presets(bundle), cost(Preset(bundle.manifest.steps), bundle)
     costs = [cost(presets[name], bundle) for name in ("fast", "balanced")]
     assert costs == sorted(costs) and costs[-1] <= own
+
+
+def test_a_bundle_that_is_not_there_is_no_broken_promise(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "dior_rt.bench.presets", tmp_path / "none"]
+    said = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert said.returncode == 2 and said.stderr == f"dior-rt: There is no bundle at {tmp_path / 'none'}.\n"
