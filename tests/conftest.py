@@ -45,3 +45,13 @@ def mini_bundle(tmp_path_factory) -> Path:
     quick = dataclasses.replace(shipped, name="small", grid=grid, steps=4, guidance=2.0, noise_scale=1.0)
     write_bundle(folder / "small", quick, {name: folder / "shipped" / name for name in shipped.files})
     return folder / "small"
+
+
+@pytest.fixture
+def another_precision():
+    """accelerate holds a process to its first precision; it forgets it here as in its own tests."""
+    from accelerate.state import AcceleratorState
+
+    AcceleratorState._reset_state(reset_partial_state=True)
+    yield
+    AcceleratorState._reset_state(reset_partial_state=True)

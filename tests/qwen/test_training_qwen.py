@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import tiny_qwen
 import torch
-from accelerate.state import AcceleratorState
 from agreement_qwen import AREA, RECIPE, call_both
 from PIL import Image
 from safetensors.torch import load_file
@@ -245,14 +244,6 @@ def test_training_goes_on_from_a_lora_of_its_own_and_from_no_other(folders, trai
         training.QwenLora(folders[True], tmp_path / "other", 3, prompts, start=file)
     with pytest.raises(InputError, match="Cannot go on from the LoRA"):
         training.QwenLora(folders[True], tmp_path / "other", 4, prompts, start=tmp_path / "none")
-
-
-@pytest.fixture
-def another_precision():
-    """accelerate holds a process to its first precision; it forgets it here as in its own tests."""
-    AcceleratorState._reset_state(reset_partial_state=True)
-    yield
-    AcceleratorState._reset_state(reset_partial_state=True)
 
 
 @pytest.mark.usefixtures("another_precision")

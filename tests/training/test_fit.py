@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from accelerate.state import AcceleratorState
 from peft import PeftModel
 from safetensors.torch import load_file
 
@@ -86,14 +85,6 @@ def test_a_damaged_state_is_not_taken_up(renders, tmp_path) -> None:
     (tmp_path / STATE).write_bytes(b"no state")
     with pytest.raises(InputError, match="cannot go on"):
         fit(renders, tmp_path, TINY, SHORT)
-
-
-@pytest.fixture
-def another_precision():
-    """accelerate holds a process to its first precision; it forgets it here as in its own tests."""
-    AcceleratorState._reset_state(reset_partial_state=True)
-    yield
-    AcceleratorState._reset_state(reset_partial_state=True)
 
 
 @pytest.mark.usefixtures("another_precision")
