@@ -57,6 +57,7 @@ def fit(
     depth: Annotated[int, typer.Option(min=1)] = 6,
     heads: Annotated[int, typer.Option(min=1)] = 8,
     precision: Precision = "no",
+    compiled: Annotated[bool, typer.Option("--compile", help="Minutes at first, then faster steps.")] = False,
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:
     """Train the network on renders. `accelerate launch -m dior_rt train fit ...` uses several GPUs."""
@@ -64,7 +65,7 @@ def fit(
     from dior_rt.training.fit import fit as run
     from dior_rt.training.network import Config
 
-    plan = Plan(steps, batch, rate, seed=seed, precision=precision)
+    plan = Plan(steps, batch, rate, seed=seed, precision=precision, compiled=compiled)
     with _Bar(steps) as bar:
         run(renders, out, Config(width, depth, heads), plan, bar.show)
 

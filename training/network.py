@@ -160,9 +160,19 @@ class Mini(nn.Module):
                 nn.init.zeros_(weight)
 
     def forward(
-        self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
-    ) -> Tensor:
-        return self.step(x, sigma, mode, *self.encode(photo, light, mask))
+        self,
+        x: Tensor,
+        sigma: Tensor,
+        photo: Tensor,
+        light: Tensor,
+        mask: Tensor,
+        mode: Tensor,
+        with_own: bool = False,
+    ) -> Tensor | tuple[Tensor, Tensor]:
+        """The velocity; and, where asked for, what the network takes for the photo's own light, encoded."""
+        relit, own = self._answers(x, sigma, mode, *self.encode(photo, light, mask))
+        towards = _towards(relit, own, x, sigma, mode)
+        return (towards, own) if with_own else towards
 
     def encode(self, photo: Tensor, light: Tensor, mask: Tensor) -> Features:
         """What photo and strokes say, whatever the flow's state."""
@@ -190,6 +200,21 @@ class Mini(nn.Module):
         tokens: Tensor,
     ) -> Tensor:
         """The velocity at x and sigma, with what `encode` made of photo and strokes."""
+        relit, own = self._answers(x, sigma, mode, given, fine, half, quarter, tokens)
+        return _towards(relit, own, x, sigma, mode)
+
+    def _answers(
+        self,
+        x: Tensor,
+        sigma: Tensor,
+        mode: Tensor,
+        given: Tensor,
+        fine: Tensor,
+        half: Tensor,
+        quarter: Tensor,
+        tokens: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """The relit picture less the photo, as x0 has it, and the photo's own light, encoded."""
         condition = F.silu(self.time(waves(sigma, self.config.width)) + self.mode(mode))  # (B, width)
         cells = self._transform(tokens + self.embed_state(x), condition)  # (B, 128, h / 4, w / 4)
         cells = self.blend_quarter(cells + quarter)  # (B, 64, h / 2, w / 2)
@@ -202,9 +227,7 @@ class Mini(nn.Module):
         own = white + own  # the photo's own light, encoded; of white paper it is the photo itself
         # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
         drawn = mask * (aim - torch.log(decode_light(own.clamp(max=BRIGHTEST)) + BOUNCED))
-        relit = _relight(photo, linear, raw + drawn + (1 - mask) * self._reach(drawn, mask, gates))
-        expected = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
-        return velocity(x, sigma[:, None, None, None], expected)
+        return _relight(photo, linear, raw + drawn + (1 - mask) * self._reach(drawn, mask, gates)), own
 
     def _reach(self, drawn: Tensor, mask: Tensor, gates: Tensor) -> Tensor:
         """How the light of the strokes goes on beside them: gates say how much of what is drawn nearby,
@@ -305,6 +328,12 @@ def rotate(part: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
     cosine, sine = turns
     a, b = part.chunk(2, dim=-1)
     return torch.cat([a * cosine - b * sine, a * sine + b * cosine], dim=-1)
+
+
+def _towards(relit: Tensor, own: Tensor, x: Tensor, sigma: Tensor, mode: Tensor) -> Tensor:
+    """The velocity towards what the mode asks for."""
+    expected = torch.where(mode[:, None, None, None] == 0, relit, 2 * own - 1)
+    return velocity(x, sigma[:, None, None, None], expected)
 
 
 def _relight(photo: Tensor, linear: Tensor, ratio: Tensor) -> Tensor:

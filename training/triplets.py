@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.random import Generator
 from numpy.typing import NDArray
+from scipy.ndimage import label
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import IterableDataset
@@ -31,9 +32,12 @@ from dior_rt.training.textures import rainbow
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
 Raster = NDArray[np.float32]
 
-GRIDS = ((64, 64), (64, 64), (56, 80), (80, 56), (56, 72), (72, 56))
+GRIDS = ((64, 64), (56, 80), (80, 56))
 KINDS = ("change", "replace", "keep")
 KIND_SHARES = (0.5, 0.38, 0.12)
+DABS = {"change": 0.2, "replace": 0.1, "keep": 0.2}  # the share of pairs with one dab for all strokes
+BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
+DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
 
 
@@ -79,14 +83,14 @@ def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lig
     changed = lights.copy()
     k = rng.choice(np.flatnonzero(usable))
     if not lights[k].any():
-        changed[k] = 2 ** rng.uniform(-1.5, 2) * tint(rng)
+        changed[k] = 2 ** rng.uniform(-1.5, 3) * tint(rng)
         return changed
     alone = np.count_nonzero(lights.any(axis=1)) == 1
     how = rng.choice(["strength", "tint"] if alone else ["remove", "strength", "tint"])
     if how == "remove":
         changed[k] = 0
     elif how == "strength":
-        changed[k] *= 2 ** rng.uniform(-3, 3)
+        changed[k] *= 2 ** rng.uniform(-3.5, 3.5)
     else:
         changed[k] = np.linalg.norm(lights[k]) / np.sqrt(3) * tint(rng)
     return changed
@@ -110,12 +114,15 @@ def pair(rng: Generator, view: View, kind: str | None = None) -> Pair:
     photo, source = mix(view, lights)
     relit, target = mix(view, relights)
     exposure, strength = exposed(photo, rng.uniform(0.3, 1.1)), 1.0
-    # A picture lost in white teaches nothing. One changed light must stay itself beside the others, so the
-    # exposure gives way to it; lights that replace all others may be as strong as suits.
-    if kind == "change":
+    # A picture lost in white teaches little. One changed light must stay itself beside the others, so the
+    # exposure gives way to it; lights that replace all others may be as strong as suits. But a person may
+    # draw light that burns a place out, and has to see it burn.
+    burnt = rng.uniform() < BURNT
+    if kind == "change" and not burnt:
         exposure = min(exposure, exposed(relit, rng.uniform(0.9, 1.5)))
     elif kind == "replace":
-        strength = exposed(relit, rng.uniform(0.3, 1.1)) / exposure
+        white = 2 ** rng.uniform(0, 2) if burnt else rng.uniform(0.3, 1.1)
+        strength = exposed(relit, white) / exposure
     return Pair(
         kind,
         photo=np.clip(photo * exposure, 0, 1),
@@ -153,13 +160,13 @@ def interest(sample: Pair) -> Raster:
 def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     """Light (h, w, 3) and mask (h, w) that a person might have drawn for the pair, at grid size."""
     seed = int(rng.integers(2**31))
+    if rng.uniform() < DABS[sample.kind]:
+        mask = dab(rng, interest(sample))
+        return flat(sample.target, mask), mask
     if sample.kind == "change" and rng.uniform() < 0.85:
         drawn = ops.sparsify(sample.target, "strokes", seed, interest=interest(sample))
         if rng.uniform() < 0.5:
-            # A person's brush lays one colour; a map's own values vary along a stroke.
-            inside = drawn.mask > 0
-            flat = np.where(inside[..., None], drawn.light[inside].mean(axis=0), 0)
-            return flat.astype(np.float32), drawn.mask
+            return flat(sample.target, drawn.mask), drawn.mask
     else:
         modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
         mode = modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
@@ -167,16 +174,36 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     return drawn.light, drawn.mask
 
 
+def dab(rng: Generator, interest: Raster) -> Raster:
+    """The mask (h, w) of one round touch of the brush, where interest says."""
+    height, width = interest.shape
+    share = interest.ravel().astype(np.float64)
+    centre = int(rng.choice(share.size, p=share / share.sum()))
+    radius = max(rng.uniform(*DAB) * min(height, width), 1.0)
+    rows, columns = np.indices((height, width))
+    away = np.hypot(rows - centre // width, columns - centre % width)
+    return (away <= radius).astype(np.float32)
+
+
+def flat(lumi: Raster, mask: Raster) -> Raster:
+    """The map under a mask, each stroke of the mean colour there: a brush lays one, a map's values vary."""
+    strokes, count = label(mask > 0)
+    light = np.zeros_like(lumi)
+    for k in range(1, count + 1):
+        light[strokes == k] = lumi[strokes == k].mean(axis=0)
+    return light
+
+
 @dataclass(frozen=True)
 class Mix:
     """The share of samples that estimate; of the others, the share without strokes, for guidance."""
 
-    estimate: float = 0.15
+    estimate: float = 0.08
     null: float = 0.08
 
 
 class Batches(IterableDataset[dict[str, Tensor]]):
-    """An endless stream of batches: the network's inputs and `x0`. The n-th is the same on every run.
+    """An endless stream of batches: the network's inputs, `x0` and `own`. The n-th is the same on every run.
 
     start: the number of the first batch. rank: of this process, where several train together.
     """
@@ -209,7 +236,7 @@ class Batches(IterableDataset[dict[str, Tensor]]):
 
 
 def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: Mode) -> dict[str, Tensor]:
-    """The network's inputs for a pair, and x0: what it should find."""
+    """The network's inputs for a pair, and what it should find: x0, and `own`, the light on the photo."""
 
     def planes(raster: Raster) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1).contiguous()
@@ -217,16 +244,15 @@ def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: Mode) -> 
     light, mask = strokes or (np.zeros_like(sample.photo), np.zeros(sample.photo.shape[:2], np.float32))
     # A photo reaches the runtime in 8 bits.
     photo = (linear_to_srgb(planes(sample.photo)) * 255).round() / 255
-    if mode == "relight":
-        x0 = RELIT_SCALE * (linear_to_srgb(planes(sample.relit)) - photo)
-    else:
-        x0 = 2 * encode_light(planes(sample.source)) - 1
+    own = 2 * encode_light(planes(sample.source)) - 1
+    x0 = RELIT_SCALE * (linear_to_srgb(planes(sample.relit)) - photo) if mode == "relight" else own
     return {
         "photo": photo,
         "light": planes(light),
         "mask": planes(mask[..., None]),
         "mode": torch.tensor(MODES[mode]),
         "x0": x0,
+        "own": own,
     }
 
 

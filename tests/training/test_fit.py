@@ -128,3 +128,27 @@ def test_flow_times_are_one_or_shifted_towards_it() -> None:
     assert sigma.min() >= 0.02 and sigma.max() == 1
     assert len(below) / len(sigma) == pytest.approx(0.5, abs=0.02)
     assert float(below.median()) == pytest.approx(8 * 0.5 / (1 + 7 * 0.5), abs=0.01)
+
+
+def test_the_photos_own_light_is_learnt_from_every_sample(views) -> None:
+    torch.manual_seed(0)
+    batch, network = next(iter(Batches(views, 8, seed=3))), Mini(TINY)
+    noise, sigma = torch.randn_like(batch["x0"]), torch.ones(8)
+    without = {name: value for name, value in batch.items() if name != "own"}
+    plain, whole = (flow_loss(network, each, sigma, noise, own=0.5) for each in (without, batch))
+    _, light = network(
+        noise, sigma, batch["photo"], batch["light"], batch["mask"], batch["mode"], with_own=True
+    )
+    error = (2 * light - 1 - batch["own"]).square().mean()
+    torch.testing.assert_close(whole, plain + 0.5 * error)
+    estimates = batch["mode"] == 1
+    assert torch.equal(batch["own"][estimates], batch["x0"][estimates])
+
+
+@pytest.mark.slow
+def test_compiled_training_is_training(renders, tmp_path) -> None:
+    for name, compiled in (("plain", False), ("compiled", True)):
+        fit(renders, tmp_path / name, TINY, replace(SHORT, steps=2, compiled=compiled))
+    plain, compiled = (load_file(tmp_path / name / WEIGHTS) for name in ("plain", "compiled"))
+    for key, weight in plain.items():
+        torch.testing.assert_close(compiled[key], weight, rtol=1e-3, atol=1e-5)

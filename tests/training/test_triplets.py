@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import label
 
 from dior_rt.family import mini
 from dior_rt.kernels import NumpyOps, Strokes
@@ -15,8 +16,10 @@ from dior_rt.training.triplets import (
     Batches,
     Mix,
     Pair,
+    dab,
     draw,
     example,
+    flat,
     mix,
     pair,
     random_lights,
@@ -209,3 +212,34 @@ def test_shares_say_how_many_estimate_and_how_many_draw_nothing(views) -> None:
     kept = drawn["photo"] + drawn["x0"] / 4
     assert kept.min() > -1e-5 and kept.max() < 1 + 1e-5
     assert float(linear_to_srgb(torch.tensor(1.0))) == pytest.approx(1)
+
+
+def test_a_brush_lays_one_colour_a_stroke() -> None:
+    lumi = np.random.default_rng(0).uniform(0, 2, (8, 12, 3)).astype(np.float32)
+    mask = np.zeros((8, 12), np.float32)
+    mask[1:3, 1:4], mask[5:8, 6:12] = 1, 1
+    laid = flat(lumi, mask)
+    np.testing.assert_allclose(
+        laid[1:3, 1:4], np.broadcast_to(lumi[1:3, 1:4].mean((0, 1)), (2, 3, 3)), rtol=1e-5
+    )
+    np.testing.assert_allclose(laid[5:, 6:], np.broadcast_to(lumi[5:, 6:].mean((0, 1)), (3, 6, 3)), rtol=1e-5)
+    assert not laid[mask == 0].any()
+
+
+def test_a_dab_is_one_round_touch_where_interest_lies() -> None:
+    wanted = np.zeros((40, 60), np.float32)
+    wanted[10, 45] = 1
+    areas = []
+    for seed in range(20):
+        mask = dab(np.random.default_rng(seed), wanted)
+        rows, columns = np.nonzero(mask)
+        assert mask[10, 45] == 1 and label(mask)[1] == 1
+        assert abs(rows.mean() - 10) < 0.6 and abs(columns.mean() - 45) < 0.6
+        areas.append(mask.sum() / np.pi)
+    radii = np.sqrt(areas) / 40
+    assert radii.min() > 0.03 and radii.max() < 0.17 and radii.max() > 1.5 * radii.min()
+
+
+def test_some_changed_lights_burn_the_picture_out(views) -> None:
+    burnt = [np.mean(sample.relit.max(axis=2) >= 1) for _, sample in pairs(views, "change", 60)]
+    assert np.mean(np.array(burnt) > 0.3) > 0.02 and np.median(burnt) < 0.15
