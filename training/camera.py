@@ -76,7 +76,7 @@ class Camera:
         photo += np.float32(self.sharpening) * (photo - softened(photo, SHARPENING_BLUR))
         if self.quality is not None:
             photo += jpeg_error(photo, self.quality, self.pixels)
-        return eight_bits(photo) / np.float32(255)
+        return eight_bits(photo).astype(np.float32) / np.float32(255)
 
 
 def random_camera(rng: Generator) -> Camera:
@@ -138,7 +138,7 @@ def jpeg_error(photo: Raster, quality: int, pixels: float) -> Raster:
     whole.save(file, "JPEG", quality=quality, subsampling="4:2:0")
     error = ImageChops.subtract(Image.open(file), whole, offset=ZERO)
     cells = np.asarray(error.resize((width, height), Image.Resampling.BOX), np.float32)
-    return (cells - ZERO) / 255
+    return (cells - np.float32(ZERO)) / np.float32(255)
 
 
 def eight_bits(encoded: Raster) -> NDArray[np.uint8]:

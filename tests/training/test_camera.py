@@ -236,8 +236,8 @@ def test_codes_are_the_nearest() -> None:
     )
 
 
-def test_a_camera_keeps_everything_but_what_is_changed() -> None:
-    """What only the photo has leaves the relit picture, which is merely developed, as it was."""
+def test_only_the_style_reaches_a_developed_picture() -> None:
+    """And without flaws a photo is that picture in eight bits."""
     for camera in styled(30):
         flawless = replace(camera, shot_noise=0, read_noise=0, blur=0, sharpening=0, quality=None)
         np.testing.assert_array_equal(camera.develop(any_light()), flawless.develop(any_light()))
