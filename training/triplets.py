@@ -1,8 +1,9 @@
 """Triplets (photo, strokes, relit photo) mixed on the fly from renders of single sources, in linear light.
 
 A photo is the sum of its sources' renders, each with a strength and a tint, under one exposure that source
-and target share; its Lumi map is the same sum of their Lumi maps. Three kinds of pair: one light is added,
-removed or changed and the strokes speak of where it matters; all lights are replaced; nothing changes.
+and target share; its Lumi map is the same sum of their Lumi maps. Four kinds of pair: one light is added,
+removed or changed, and the strokes speak of where it matters; the same in one part of the picture only; all
+lights are replaced; nothing changes. A camera makes pictures of the light.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from dior_rt.family import Mode
 from dior_rt.family.mini import MODES
 from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
-from dior_rt.training.network import RELIT_SCALE, encode_light, linear_to_srgb
+from dior_rt.training.camera import Camera, random_camera, white_balance
+from dior_rt.training.network import RELIT_SCALE, encode_light
 from dior_rt.training.render import View
 from dior_rt.training.textures import rainbow
 
@@ -33,9 +35,9 @@ Lights = NDArray[np.float32]  # (sources, 3): strength times tint
 Raster = NDArray[np.float32]
 
 GRIDS = ((64, 64), (56, 80), (80, 56))
-KINDS = ("change", "replace", "keep")
-KIND_SHARES = (0.5, 0.38, 0.12)
-DABS = {"change": 0.2, "replace": 0.1, "keep": 0.2}  # the share of pairs with one dab for all strokes
+KINDS = ("change", "local", "replace", "keep")
+KIND_SHARES = (0.25, 0.3, 0.33, 0.12)
+DABS = {"change": 0.2, "local": 0.35, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
 DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
@@ -54,8 +56,12 @@ class Pair:
 
 def mix(view: View, lights: Lights) -> tuple[Raster, Raster]:
     """The image and the Lumi map of a view under some lights."""
-    image = (view.images * lights[:, None, None]).sum(axis=0, dtype=np.float32)
-    return image, (view.lumi * lights[:, None, None]).sum(axis=0, dtype=np.float32)
+    image = np.zeros(view.images.shape[1:], np.float32)
+    lumi = np.zeros_like(image)
+    for k in np.flatnonzero(lights.any(axis=1)):
+        image += view.images[k] * lights[k]
+        lumi += view.lumi[k] * lights[k]
+    return image, lumi
 
 
 def tint(rng: Generator) -> Raster:
@@ -83,14 +89,14 @@ def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lig
     changed = lights.copy()
     k = rng.choice(np.flatnonzero(usable))
     if not lights[k].any():
-        changed[k] = 2 ** rng.uniform(-1.5, 3) * tint(rng)
+        changed[k] = 2 ** rng.uniform(-1.5, 2) * tint(rng)
         return changed
     alone = np.count_nonzero(lights.any(axis=1)) == 1
     how = rng.choice(["strength", "tint"] if alone else ["remove", "strength", "tint"])
     if how == "remove":
         changed[k] = 0
     elif how == "strength":
-        changed[k] *= 2 ** rng.uniform(-3.5, 3.5)
+        changed[k] *= 2 ** rng.uniform(-3, 3)
     else:
         changed[k] = np.linalg.norm(lights[k]) / np.sqrt(3) * tint(rng)
     return changed
@@ -101,28 +107,49 @@ def exposed(image: Raster, white: float) -> float:
     return white / max(float(np.percentile(image.max(axis=2), 95)), 1e-4)
 
 
-def pair(rng: Generator, view: View, kind: str | None = None) -> Pair:
-    """A random pair of one view, of the given kind or of any."""
+def flag(rng: Generator, shape: tuple[int, int]) -> Raster:
+    """(h, w) in 0..1: what of a light passes where flags keep it off all but one soft-edged part."""
+    rows, columns = np.indices(shape) + 0.5
+    x = (columns - rng.uniform(0, shape[1])) / min(shape)
+    y = (rows - rng.uniform(0, shape[0])) / min(shape)
+    angle, wide, long = rng.uniform(0, np.pi), *np.exp(rng.uniform(np.log(0.15), np.log(0.6), 2))
+    along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
+    away = np.hypot(along / long, across / wide)  # 1 where half of the light passes
+    return (1 / (1 + away ** rng.uniform(2, 8))).astype(np.float32)
+
+
+def pair(
+    rng: Generator,
+    view: View,
+    kind: str | None = None,
+    burnt: bool = False,
+    balance: Raster | float = 1.0,
+) -> Pair:
+    """A random pair of one view, of the given kind or of any.
+
+    burnt: the relit picture may be far too bright for the display. balance: (3,) tints all lights alike.
+    """
     usable = view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
     kind = kind or str(rng.choice(KINDS, p=KIND_SHARES))
     lights = random_lights(rng, usable)
     relights = lights
-    if kind == "change":
+    if kind in ("change", "local"):
         relights = change_one(rng, lights, usable)
     elif kind == "replace":
         relights = random_lights(rng, usable)
-    photo, source = mix(view, lights)
-    relit, target = mix(view, relights)
+    photo, source = mix(view, lights * balance)
+    relit, target = mix(view, relights * balance)
+    if kind == "local":
+        passing = flag(rng, photo.shape[:2])[..., None]
+        relit, target = photo + passing * (relit - photo), source + passing * (target - source)
     exposure, strength = exposed(photo, rng.uniform(0.3, 1.1)), 1.0
     # A picture lost in white teaches little. One changed light must stay itself beside the others, so the
     # exposure gives way to it; lights that replace all others may be as strong as suits. But a person may
     # draw light that burns a place out, and has to see it burn.
-    burnt = rng.uniform() < BURNT
-    if kind == "change" and not burnt:
+    if kind in ("change", "local") and not burnt:
         exposure = min(exposure, exposed(relit, rng.uniform(0.9, 1.5)))
     elif kind == "replace":
-        white = 2 ** rng.uniform(0, 2) if burnt else rng.uniform(0.3, 1.1)
-        strength = exposed(relit, white) / exposure
+        strength = exposed(relit, 2 ** rng.uniform(0, 2) if burnt else rng.uniform(0.3, 1.1)) / exposure
     return Pair(
         kind,
         photo=np.clip(photo * exposure, 0, 1),
@@ -140,15 +167,18 @@ def window(rng: Generator, size: int, grid: tuple[int, int]) -> tuple[slice, sli
     return slice(top, top + height), slice(left, left + width), bool(rng.uniform() < 0.5)
 
 
-def zoomed(view: View, rows: slice, columns: slice, mirror: bool, grid: tuple[int, int]) -> View:
-    """A part of a view resampled to the grid, in linear light; its rasters are float32."""
-    renders = np.stack([view.images, view.lumi])[:, :, rows, columns].astype(np.float32)
-    planes = torch.from_numpy(renders).permute(0, 1, 4, 2, 3).flatten(0, 2)[None]
+def part(view: View, rows: slice, columns: slice) -> View:
+    return replace(view, images=view.images[:, rows, columns], lumi=view.lumi[:, rows, columns])
+
+
+def zoomed(sample: Pair, grid: tuple[int, int], mirror: bool = False) -> Pair:
+    """The pair resampled to the grid, in linear light."""
+    rasters = np.stack([sample.photo, sample.relit, sample.source, sample.target])
+    planes = torch.from_numpy(rasters).permute(0, 3, 1, 2)
     small = F.interpolate(planes, size=grid, mode="bilinear", antialias=True).clamp_min(0)
     if mirror:
         small = small.flip(3)
-    images, lumi = small.unflatten(1, (2, -1, 3))[0].permute(0, 1, 3, 4, 2).contiguous().numpy()
-    return replace(view, images=images, lumi=lumi)
+    return Pair(sample.kind, *small.permute(0, 2, 3, 1).contiguous().numpy())
 
 
 def interest(sample: Pair) -> Raster:
@@ -163,7 +193,7 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     if rng.uniform() < DABS[sample.kind]:
         mask = dab(rng, interest(sample))
         return flat(sample.target, mask), mask
-    if sample.kind == "change" and rng.uniform() < 0.85:
+    if sample.kind in ("change", "local") and rng.uniform() < 0.85:
         drawn = ops.sparsify(sample.target, "strokes", seed, interest=interest(sample))
         if rng.uniform() < 0.5:
             return flat(sample.target, drawn.mask), drawn.mask
@@ -171,6 +201,10 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
         modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
         mode = modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
         drawn = ops.sparsify(sample.target, mode, seed)
+        if mode == "strokes" and sample.kind == "replace":
+            # Who lights a whole picture anew draws more than once; a lone stroke means its own place.
+            more = ops.sparsify(sample.target, mode, int(rng.integers(2**31)))
+            return np.maximum(drawn.light, more.light), np.maximum(drawn.mask, more.mask)
     return drawn.light, drawn.mask
 
 
@@ -228,30 +262,49 @@ class Batches(IterableDataset[dict[str, Tensor]]):
 
     def _sample(self, rng: Generator, grid: tuple[int, int]) -> dict[str, Tensor]:
         view = self.views[rng.integers(len(self.views))]
-        small = pair(rng, zoomed(view, *window(rng, view.images.shape[1], grid), grid))
+        rows, columns, mirror = window(rng, view.images.shape[1], grid)
+        burnt, balance = rng.uniform() < BURNT, white_balance(rng)
+        small = zoomed(pair(rng, part(view, rows, columns), burnt=burnt, balance=balance), grid, mirror)
+        shots = Shots.of(small, random_camera(rng), rng)
         if rng.uniform() < self.shares.estimate:
-            return example(small, None, "estimate")
+            return example(small, shots, None, "estimate")
         strokes = None if rng.uniform() < self.shares.null else draw(rng, NumpyOps(), small)
-        return example(small, strokes, "relight")
+        return example(small, shots, strokes, "relight")
 
 
-def example(sample: Pair, strokes: tuple[Raster, Raster] | None, mode: Mode) -> dict[str, Tensor]:
+@dataclass(frozen=True)
+class Shots:
+    """What a camera makes of a pair: the photo in 8 bits, and how much the new light changes the picture.
+
+    photo: (H, W, 3) float32, sRGB-encoded. change: of the encoded values. The camera's flaws are the
+    photo's own and stay in the relit picture, so the change has none.
+    """
+
+    photo: Raster
+    change: Raster
+
+    @staticmethod
+    def of(sample: Pair, camera: Camera, rng: Generator) -> Shots:
+        change = camera.develop(sample.relit) - camera.develop(sample.photo)
+        return Shots(camera.shot(sample.photo, rng), change)
+
+
+def example(
+    sample: Pair, shots: Shots, strokes: tuple[Raster, Raster] | None, mode: Mode
+) -> dict[str, Tensor]:
     """The network's inputs for a pair, and what it should find: x0, and `own`, the light on the photo."""
 
     def planes(raster: Raster) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1).contiguous()
 
     light, mask = strokes or (np.zeros_like(sample.photo), np.zeros(sample.photo.shape[:2], np.float32))
-    # A photo reaches the runtime in 8 bits.
-    photo = (linear_to_srgb(planes(sample.photo)) * 255).round() / 255
     own = 2 * encode_light(planes(sample.source)) - 1
-    x0 = RELIT_SCALE * (linear_to_srgb(planes(sample.relit)) - photo) if mode == "relight" else own
     return {
-        "photo": photo,
+        "photo": planes(shots.photo),
         "light": planes(light),
         "mask": planes(mask[..., None]),
         "mode": torch.tensor(MODES[mode]),
-        "x0": x0,
+        "x0": RELIT_SCALE * planes(shots.change) if mode == "relight" else own,
         "own": own,
     }
 

@@ -9,6 +9,7 @@ from scipy.ndimage import label
 
 from dior_rt.family import mini
 from dior_rt.kernels import NumpyOps, Strokes
+from dior_rt.training.camera import Camera, random_camera
 from dior_rt.training.network import decode_light, linear_to_srgb
 from dior_rt.training.triplets import (
     GRIDS,
@@ -16,12 +17,15 @@ from dior_rt.training.triplets import (
     Batches,
     Mix,
     Pair,
+    Shots,
     dab,
     draw,
     example,
+    flag,
     flat,
     mix,
     pair,
+    part,
     random_lights,
     tint,
     zoomed,
@@ -64,7 +68,7 @@ def test_pairs_are_float32_pictures_on_display(views, kind: str) -> None:
         assert sample.photo.max() <= 1 and sample.relit.max() <= 1 and sample.photo.max() > 0.2
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["change", "replace", "keep"])
 def test_pictures_and_their_maps_come_of_the_same_lights_and_exposure(views, kind: str) -> None:
     for view, sample in pairs(views, kind, 6):
         for picture, lumi in ((sample.photo, sample.source), (sample.relit, sample.target)):
@@ -117,7 +121,7 @@ def test_strokes_say_what_light_is_there(views, kind: str) -> None:
         assert not light[~inside].any()
         # A stroke's own values, a cell's mean, or one colour for all: each keeps the light's mean.
         drawn, true = light[inside].mean(axis=0), sample.target[inside].mean(axis=0)
-        np.testing.assert_allclose(drawn, true, rtol=1e-3, atol=1e-5)
+        np.testing.assert_allclose(drawn, true, rtol=2e-3, atol=1e-5)
         assert (light <= sample.target.max(axis=(0, 1)) * 1.001).all()
         masks.append(inside.mean())
     assert min(masks) < 0.5
@@ -134,25 +138,27 @@ def test_strokes_of_a_change_seek_the_change() -> None:
     assert right > 1.5 * left
 
 
-def test_a_part_of_a_view_keeps_its_light(views) -> None:
-    view = views[0]
-    whole = zoomed(view, slice(0, 24), slice(0, 24), False, (8, 8))
-    mean = view.lumi.astype(np.float32).mean(axis=(1, 2))
-    np.testing.assert_allclose(whole.lumi.mean(axis=(1, 2)), mean, rtol=0.1)
-    flat = replace(view, images=np.full_like(view.images, 0.3), lumi=np.full_like(view.lumi, 0.7))
-    part = zoomed(flat, slice(3, 19), slice(5, 23), True, (12, 16))
-    assert part.images.shape == part.lumi.shape == (5, 12, 16, 3) and part.lumi.dtype == np.float32
-    np.testing.assert_allclose(part.images, 0.3, rtol=1e-3)
-    np.testing.assert_allclose(part.lumi, 0.7, rtol=1e-3)
-    mirrored = zoomed(view, slice(0, 24), slice(0, 24), True, (8, 8))
-    np.testing.assert_array_equal(mirrored.lumi, whole.lumi[:, :, ::-1])
-    np.testing.assert_array_equal(mirrored.images, whole.images[:, :, ::-1])
+def test_a_zoomed_pair_keeps_its_light(views) -> None:
+    _, sample = pairs(views, "replace", 1)[0]
+    small, mirrored = zoomed(sample, (8, 12)), zoomed(sample, (8, 12), mirror=True)
+    for name in ("photo", "relit", "source", "target"):
+        raster, few = getattr(sample, name), getattr(small, name)
+        assert few.shape == (8, 12, 3) and few.dtype == np.float32
+        np.testing.assert_allclose(few.mean(axis=(0, 1)), raster.mean(axis=(0, 1)), rtol=0.1)
+        np.testing.assert_array_equal(getattr(mirrored, name), few[:, ::-1])
+
+
+def test_a_part_of_a_view_is_that_part(views) -> None:
+    cut = part(views[0], slice(3, 19), slice(5, 23))
+    np.testing.assert_array_equal(cut.lumi, views[0].lumi[:, 3:19, 5:23])
+    np.testing.assert_array_equal(cut.images, views[0].images[:, 3:19, 5:23])
 
 
 def test_examples_speak_the_runtime_s_language(views) -> None:
     _, sample = pairs(views, "replace", 1)[0]
     light, mask = draw(np.random.default_rng(0), NumpyOps(), sample)
-    made = example(sample, (light, mask), "relight")
+    shots = Shots.of(sample, Camera(), np.random.default_rng(0))
+    made = example(sample, shots, (light, mask), "relight")
     photo = NumpyOps().decode_srgb(NumpyOps().encode_srgb(sample.photo, np.uint8))
     encoded = NumpyOps().encode_srgb(photo, np.float32)
     condition = mini.encode(encoded, Strokes(light, mask), "relight")
@@ -161,12 +167,48 @@ def test_examples_speak_the_runtime_s_language(views) -> None:
     assert int(made["mode"]) == mini.MODES["relight"]
     shown = made["photo"] + made["x0"] / 4
     relit = NumpyOps().encode_srgb(sample.relit, np.float32)
-    np.testing.assert_allclose(shown.permute(1, 2, 0), relit, atol=1e-5)
-    estimate = example(sample, None, "estimate")
+    np.testing.assert_allclose(shown.permute(1, 2, 0), relit, atol=0.6 / 255)  # the photo's own rounding
+    estimate = example(sample, shots, None, "estimate")
     assert not estimate["mask"].any() and not estimate["light"].any()
     assert int(estimate["mode"]) == mini.MODES["estimate"]
     found = decode_light((estimate["x0"] + 1) / 2).permute(1, 2, 0)
     np.testing.assert_allclose(found, sample.source, rtol=1e-3, atol=1e-5)
+
+
+def test_a_camera_s_flaws_stay_where_light_does_not_change(views) -> None:
+    _, sample = pairs(views, "keep", 1)[0]
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        shots = Shots.of(sample, random_camera(rng), rng)
+        assert not shots.change.any()
+
+
+def test_local_changes_leave_more_of_the_picture(views) -> None:
+    def still(kind: str) -> float:
+        shares = []
+        for _, sample in pairs(views, kind, 60):
+            change = np.abs(sample.relit - sample.photo).max(axis=2)
+            shares.append(np.mean(change <= 0.05 * change.max()))
+        return float(np.mean(shares))
+
+    assert still("local") > still("change") + 0.1
+
+
+def test_flags_let_light_pass_in_one_part() -> None:
+    for seed in range(20):
+        passing = flag(np.random.default_rng(seed), (48, 64))
+        assert passing.shape == (48, 64) and passing.dtype == np.float32
+        assert passing.min() >= 0 and 0.5 < passing.max() <= 1
+
+
+def test_lone_strokes_are_for_single_places(views) -> None:
+    counts = {kind: [] for kind in KINDS}
+    for kind in KINDS:
+        for k, (_, sample) in enumerate(pairs(views, kind, 60)):
+            _, mask = draw(np.random.default_rng(k), NumpyOps(), zoomed(sample, (64, 64)))
+            counts[kind].append(label(mask)[1])
+    alone = {kind: np.mean(np.array(found) == 1) for kind, found in counts.items()}
+    assert alone["local"] > 0.25 and alone["local"] > alone["replace"]
 
 
 def batch(views, number: int, **options) -> dict[str, torch.Tensor]:
@@ -210,7 +252,7 @@ def test_shares_say_how_many_estimate_and_how_many_draw_nothing(views) -> None:
     drawn = batch(views, 0, shares=Mix(estimate=0.0, null=0.0))
     assert (drawn["mode"] == 0).all() and drawn["mask"].flatten(1).any(dim=1).all()
     kept = drawn["photo"] + drawn["x0"] / 4
-    assert kept.min() > -1e-5 and kept.max() < 1 + 1e-5
+    assert kept.min() > -0.2 and kept.max() < 1.2  # in range, but for the camera's flaws
     assert float(linear_to_srgb(torch.tensor(1.0))) == pytest.approx(1)
 
 
@@ -240,6 +282,22 @@ def test_a_dab_is_one_round_touch_where_interest_lies() -> None:
     assert radii.min() > 0.03 and radii.max() < 0.17 and radii.max() > 1.5 * radii.min()
 
 
-def test_some_changed_lights_burn_the_picture_out(views) -> None:
-    burnt = [np.mean(sample.relit.max(axis=2) >= 1) for _, sample in pairs(views, "change", 60)]
-    assert np.mean(np.array(burnt) > 0.3) > 0.02 and np.median(burnt) < 0.15
+@pytest.mark.parametrize("kind", ["change", "local", "replace"])
+def test_only_where_asked_for_may_light_burn_the_picture_out(views, kind: str) -> None:
+    def whites(burnt: bool) -> np.ndarray:
+        made = [pair(np.random.default_rng(k), views[k % len(views)], kind, burnt=burnt) for k in range(60)]
+        return np.array([np.mean(sample.relit.max(axis=2) >= 1) for sample in made])
+
+    assert whites(burnt=True).mean() > 1.3 * whites(burnt=False).mean()
+
+
+def test_a_white_balance_tints_pictures_and_maps_alike(views) -> None:
+    fine = replace(views[0], images=views[0].images.astype(np.float32), lumi=views[0].lumi.astype(np.float32))
+    balance = np.array([1.2, 1.0, 0.8], np.float32)
+    tinted = pair(np.random.default_rng(3), fine, "keep", balance=balance)
+    plain = pair(np.random.default_rng(3), fine, "keep")
+    ratio = (tinted.source.sum(axis=(0, 1)) / plain.source.sum(axis=(0, 1))) / balance
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)  # but for the exposure
+    unclipped = (tinted.photo < 0.99) & (plain.photo < 0.99) & (plain.photo > 0.01)
+    shares = (tinted.photo / (plain.photo * balance + 1e-9))[unclipped]
+    np.testing.assert_allclose(shares, ratio[0], rtol=1e-3)
