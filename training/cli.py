@@ -37,13 +37,17 @@ def render(
     scenes: Annotated[int, typer.Option(min=1, help="How many scenes, two views each.")] = 750,
     seed: Annotated[int, typer.Option(min=0, max=900, help="Sets of different seeds share no scene.")] = 0,
     shard: Annotated[str, typer.Option(help="i/n: this process's share; run one process a core.")] = "0/1",
+    domain: Annotated[
+        Literal["plain", "world"],
+        typer.Option(help="world: greater variety, environment light, less noise."),
+    ] = "plain",
 ) -> None:
     """Render random scenes, every light source alone, as pictures and as Lumi maps. Resumable."""
     from dior_rt.training.render import render_scenes
 
     share = _shard(shard)
     with typer.progressbar(length=len(range(share[0], scenes, share[1])), label="scenes") as bar:
-        render_scenes(out, scenes, seed, share, lambda done, total: bar.update(1))
+        render_scenes(out, scenes, seed, share, lambda done, total: bar.update(1), domain)
 
 
 @app.command()
@@ -178,7 +182,7 @@ def synthbench(
     pairs: Annotated[int, typer.Option(min=1, max=1000)] = 600,
     seed: Annotated[int, typer.Option(min=0, max=90, help="Of other seeds, other scenes.")] = 0,
     resolution: Annotated[int, typer.Option(min=16, help="Pixels a side.")] = 128,
-    samples: Annotated[int, typer.Option(min=1, help="Rays a pixel and source.")] = 32,
+    samples: Annotated[int, typer.Option(min=1, help="Rays a pixel and source, before denoising.")] = 16,
     shard: Annotated[str, typer.Option(help="i/n: this process's share; run one process a core.")] = "0/1",
 ) -> None:
     """Render SynthBench: pairs of very different light, with true maps, for `eval`. Resumable."""

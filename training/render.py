@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -22,13 +23,38 @@ from numpy.typing import NDArray
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, reason, replacing
-from dior_rt.training.scenes import Camera, Material, Mesh, Scene, Source, Thing, scene
+from dior_rt.training.denoise import Guides
+from dior_rt.training.scenes import SOURCES, Camera, Material, Mesh, Scene, Source, Thing, scene
+from dior_rt.training.world import world
 
 RESOLUTION = 96
 SAMPLES = 8
 BOUNCES = 4
 VIEWS = 2  # a scene
 FORMAT = 1
+AROUND = ("dome", "sky")  # kinds of source that shine from everywhere
+GUIDE_SAMPLES = 4
+LIT = 0.12  # of a view's pixels, the least share that a source must reach
+
+
+@dataclass(frozen=True)
+class Domain:
+    """Where scenes come from, and how they are rendered.
+
+    scene: of a number and a count of cameras. prefix: of its files' names, as domains may share a folder.
+    choosy: whether sources that light next to nothing of a view are left out. denoised: whether renders are.
+    """
+
+    scene: Callable[[int, int], Scene]
+    prefix: str
+    choosy: bool
+    denoised: bool
+
+
+DOMAINS = {
+    "plain": Domain(scene, "", choosy=False, denoised=False),
+    "world": Domain(world, "world", choosy=True, denoised=True),
+}
 
 
 def mitsuba() -> Any:
@@ -50,7 +76,7 @@ class View:
     """One scene from one camera, by source, each alone.
 
     images, lumi: (sources, H, W, 3), linear; every source so strong that the mean of its Lumi map is 1/4.
-    kinds: of the sources, the last of which is the dome.
+    kinds: of the sources; what shines from everywhere comes last.
     """
 
     images: NDArray[np.float16]
@@ -85,34 +111,60 @@ def render_scenes(
     seed: int,
     shard: tuple[int, int] = (0, 1),
     progress: Callable[[int, int], None] | None = None,
+    domain: str = "plain",
 ) -> None:
     """Render the scenes that are not there yet, two views each, to `out/<scene>-<view>.npz`.
 
-    shard: (index, count), this process's share. Scene numbers are seed * 1,000,000 + k for k in
-    0 .. scenes - 1, so that sets of different seeds share none. Raises InputError where nothing can be
-    written.
+    domain: a name in DOMAINS. shard: (index, count), this process's share. Scene numbers are
+    seed * 1,000,000 + k for k in 0 .. scenes - 1, so that sets of different seeds share none. Raises
+    InputError where nothing can be written, or for a domain that is none.
     """
+    if domain not in DOMAINS:
+        raise InputError(f"There is no domain {domain}; there are {', '.join(DOMAINS)}.")
+    chosen = DOMAINS[domain]
     mitsuba()  # where it is missing, no folder is made
+    if chosen.denoised:
+        import mitsuba_oidn  # noqa: F401
     make_folder(out)
     index, count = shard
     mine = [seed * 1_000_000 + k for k in range(index, scenes, count)]
     for done, number in enumerate(mine):
-        paths = [out / f"{number:09d}-{v}.npz" for v in range(VIEWS)]
+        paths = [out / f"{chosen.prefix}{number:09d}-{v}.npz" for v in range(VIEWS)]
         if not all(path.exists() for path in paths):
-            described = scene(number, VIEWS)
+            described = chosen.scene(number, VIEWS)
             stage = Stage.load(described.things)
             for path, camera in zip(paths, described.cameras, strict=True):
-                view(stage, described, camera, number).save(path)
+                shown = lit(stage, described, camera) if chosen.choosy else described
+                view(stage, shown, camera, number, denoised=chosen.denoised).save(path)
         if progress:
             progress(done + 1, len(mine))
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Things in one set of materials, and the renderer's scenes of them under one source each.
+
+    To build one costs as much as to render it, so all cameras share it.
+    """
+
+    things: dict[str, Any]
+    scenes: dict[int, tuple[Source | None, Any]] = field(default_factory=dict)
+
+    def under(self, source: Source | None) -> Any:
+        """The renderer's scene under that source, or in the dark."""
+        if id(source) not in self.scenes:
+            lights = {"source": _emitter(source)} if source else {}
+            loaded = mitsuba().load_dict({"type": "scene", **lights, **self.things})
+            self.scenes[id(source)] = source, loaded  # with the source, so that its id stays its own
+        return self.scenes[id(source)][1]
 
 
 @dataclass(frozen=True)
 class Stage:
     """A scene's things as they are, and all white and matte; loaded once, as it costs as much as a render."""
 
-    original: dict[str, Any]
-    white: dict[str, Any]
+    original: Shapes
+    white: Shapes
 
     @staticmethod
     def load(things: tuple[Thing, ...]) -> Stage:
@@ -126,19 +178,45 @@ def view(
     seed: int,
     resolution: int = RESOLUTION,
     samples: int = SAMPLES,
+    denoised: bool = False,
 ) -> View:
     """Render one camera's view of every source, original and white."""
+    guides = surfaces(stage, camera, resolution) if denoised else None
     images, lumi = [], []
     for k, source in enumerate(described.sources):
-        rays = 2 * samples if source.kind == "dome" else samples  # most of the dome's rays are blocked
+        rays = 2 * samples if source.kind in AROUND else samples  # most of their rays are blocked
         light = lumi_map(stage, camera, source, resolution, rays, seed=k)
         image = picture(stage, camera, source, resolution, rays, seed=k)
+        if guides:
+            light, image = guides.lumi_map(light), guides.picture(image)
         # A source's strength is arbitrary until triplets mix it; a common mean suits half floats.
         unit = 0.25 / max(float(light.mean()), 1e-6)
         images.append(_half(image * unit))
         lumi.append(_half(light * unit))
     kinds = tuple(source.kind for source in described.sources)
     return View(np.stack(images), np.stack(lumi), kinds, described.kind, seed)
+
+
+def lit(stage: Stage, described: Scene, camera: Camera) -> Scene:
+    """The scene with the first SOURCES local sources that light enough of a view, and its environment if it
+    does. What lights next to nothing would, brought to the common mean, be noise."""
+    *local, environment = described.sources
+    found = islice((source for source in local if reach(stage, camera, source) >= LIT), SOURCES)
+    around = [environment] if reach(stage, camera, environment) >= LIT else []
+    return replace(described, sources=(*found, *around))
+
+
+def reach(stage: Stage, camera: Camera, source: Source) -> float:
+    """The share of a view's pixels that get more than a tenth of its mean light, by a quick probe."""
+    probe = np.nan_to_num(lumi_map(stage, camera, source, resolution=32, samples=4)).mean(axis=2)
+    return float((probe > 0.1 * probe.mean()).mean())
+
+
+def surfaces(stage: Stage, camera: Camera, resolution: int) -> Guides:
+    """What the camera sees of the things' own surfaces, for the denoiser."""
+    integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
+    layers = _render(stage.original, camera, None, integrator, resolution, GUIDE_SAMPLES, seed=0)
+    return Guides(*(np.ascontiguousarray(np.nan_to_num(part)) for part in np.split(layers, 2, axis=2)))
 
 
 def _half(raster: NDArray[np.float32]) -> NDArray[np.float16]:
@@ -150,7 +228,7 @@ def picture(
 ) -> NDArray[np.float32]:
     """(H, W, 3) linear radiance with the scene's own materials and bounced light."""
     integrator = {"type": "path", "max_depth": BOUNCES, "hide_emitters": True}
-    return _render(stage.original, camera, source, integrator, resolution, samples, seed)
+    return _render(stage.original, camera, source, integrator, resolution, samples, seed)[..., :3]
 
 
 def lumi_map(
@@ -158,36 +236,29 @@ def lumi_map(
 ) -> NDArray[np.float32]:
     """(H, W, 3) the Lumi map of one source of radiance 1: white matte surfaces, direct light only."""
     integrator = {"type": "direct", "hide_emitters": True}
-    return _render(stage.white, camera, source, integrator, resolution, samples, seed)
+    return _render(stage.white, camera, source, integrator, resolution, samples, seed)[..., :3]
 
 
 def _render(
-    shapes: dict[str, Any],
+    shapes: Shapes,
     camera: Camera,
-    source: Source,
+    source: Source | None,
     integrator: dict[str, Any],
     resolution: int,
     samples: int,
     seed: int,
 ) -> NDArray[np.float32]:
     mi = mitsuba()
-    loaded = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": integrator,
-            "sensor": _sensor(camera, resolution),
-            "source": _emitter(source),
-            **shapes,
-        }
-    )
-    return np.array(mi.render(loaded, spp=samples, seed=seed), dtype=np.float32)[..., :3]
+    sensor, integrate = mi.load_dict(_sensor(camera, resolution)), mi.load_dict(integrator)
+    rendered = mi.render(shapes.under(source), sensor=sensor, integrator=integrate, spp=samples, seed=seed)
+    return np.array(rendered, dtype=np.float32)
 
 
-def _load(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> dict[str, Any]:
+def _load(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> Shapes:
     mi = mitsuba()
-    return {
-        f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)
-    }
+    return Shapes(
+        {f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)}
+    )
 
 
 def _mesh(mesh: Mesh, bsdf: Any) -> Any:
@@ -210,8 +281,16 @@ def _mesh(mesh: Mesh, bsdf: Any) -> Any:
     return loaded
 
 
-def _white(_: Material) -> dict[str, Any]:
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}}
+def _white(material: Material) -> dict[str, Any]:
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+    return {"type": "twosided", "bsdf": _bumped(material, white)}
+
+
+def _bumped(material: Material, surface: dict[str, Any]) -> dict[str, Any]:
+    if material.relief is None:
+        return surface
+    heights = {"type": "bitmap", "bitmap": mitsuba().Bitmap(material.relief[..., None]), "raw": True}
+    return {"type": "bumpmap", "heights": heights, "bsdf": surface}
 
 
 def _bsdf(material: Material) -> dict[str, Any]:
@@ -224,7 +303,7 @@ def _bsdf(material: Material) -> dict[str, Any]:
         surface = {"type": "roughplastic", "diffuse_reflectance": bitmap, "alpha": material.roughness}
     else:
         surface = {"type": "roughconductor", "specular_reflectance": bitmap, "alpha": material.roughness}
-    return {"type": "twosided", "bsdf": surface}
+    return {"type": "twosided", "bsdf": _bumped(material, surface)}
 
 
 def _sensor(camera: Camera, resolution: int) -> dict[str, Any]:
@@ -252,6 +331,8 @@ def _emitter(source: Source) -> dict[str, Any]:
     area = {"type": "area", "radiance": radiance}
     if source.kind == "dome":
         return {"type": "constant", "radiance": radiance}
+    if source.kind == "sky":
+        return {"type": "envmap", "bitmap": mi.Bitmap(source.panorama)}
     if source.kind == "sphere":
         return {"type": "sphere", "center": source.at.tolist(), "radius": source.size, "emitter": area}
     to_world = mi.ScalarTransform4f().look_at(

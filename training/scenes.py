@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count, islice
 from typing import Literal
 
 import numpy as np
@@ -20,11 +22,15 @@ SOURCES = 4  # local sources a scene; the dome comes on top
 
 @dataclass(frozen=True)
 class Material:
-    """finish: how the reflectance (T, T, 3) is coated. roughness: of the coat, 0 mirror .. 1 matte."""
+    """finish: how the reflectance (T, T, 3) is coated. roughness: of the coat, 0 mirror .. 1 matte.
+
+    relief: heights (T, T) of a bumped surface, in units; their slopes tilt normals, those of Lumi maps too.
+    """
 
     finish: Literal["matte", "plastic", "metal"]
     reflectance: NDArray[np.float32]
     roughness: float
+    relief: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -38,13 +44,14 @@ class Source:
     """One light of radiance 1; a spot is a point of intensity 1. `target`: what panel and spot face.
 
     size: a sphere's radius; half a square panel's side; a spot's half angle in degrees. A dome shines from
-    everywhere and has neither place nor size.
+    everywhere and has neither place nor size; nor has a sky, whose radiance is its panorama (H, 2H, 3).
     """
 
-    kind: Literal["sphere", "panel", "spot", "dome"]
+    kind: Literal["sphere", "panel", "spot", "dome", "sky"]
     at: Vector
     target: Vector
     size: float
+    panorama: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -205,15 +212,18 @@ def _camera(rng: Generator, kind: str) -> Camera:
 
 def _sources(rng: Generator, kind: str, cameras: tuple[Camera, ...]) -> list[Source]:
     """Local sources that no camera sees, and the dome."""
-    sources: list[Source] = []
-    while len(sources) < SOURCES:
-        source = _source(rng, kind)
+    drawn = (_source(rng, kind) for _ in count())
+    return [*islice(unseen(drawn, cameras), SOURCES), Source("dome", np.zeros(3), np.zeros(3), 0.0)]
+
+
+def unseen(sources: Iterator[Source], cameras: tuple[Camera, ...]) -> Iterator[Source]:
+    """Those that lie outside of every camera's view."""
+    for source in sources:
         radius = (
             0.0 if source.kind == "spot" else source.size * (np.sqrt(2) if source.kind == "panel" else 1.0)
         )
         if not any(camera.sees(source.at, radius) for camera in cameras):
-            sources.append(source)
-    return [*sources, Source("dome", np.zeros(3), np.zeros(3), 0.0)]
+            yield source
 
 
 def _source(rng: Generator, kind: str) -> Source:

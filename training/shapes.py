@@ -35,8 +35,8 @@ class Mesh:
         return Mesh(moved.astype(np.float32), self.uv, self.faces)
 
 
-def _lattice(position: NDArray[np.float64]) -> Mesh:
-    """A mesh of positions (ALONG + 1, AROUND + 1, 3)."""
+def lattice(position: NDArray[np.float64]) -> Mesh:
+    """A mesh of positions (rows, columns, 3), which run around to the right and along downwards."""
     rows, columns = position.shape[:2]
     v, u = np.mgrid[:rows, :columns]
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -95,7 +95,7 @@ def superquadric(roundness_along: float, roundness_around: float) -> Mesh:
     x = ring * power(np.cos(around), roundness_around)
     z = -ring * power(np.sin(around), roundness_around)
     y = power(np.sin(along), roundness_along) * np.ones_like(around)
-    return _lattice(np.stack([x, y, z], axis=-1))
+    return lattice(np.stack([x, y, z], axis=-1))
 
 
 def lathe(rng: Generator) -> Mesh:
@@ -110,7 +110,7 @@ def lathe(rng: Generator) -> Mesh:
     profile[0] = profile[-1] = 0
     x, z = profile[:, None] * np.cos(around), -profile[:, None] * np.sin(around)
     y = (2 * height - 1)[:, None] * np.ones_like(around)
-    return _lattice(np.stack([x, y, z], axis=-1))
+    return lattice(np.stack([x, y, z], axis=-1))
 
 
 def torus(thickness: float) -> Mesh:
@@ -119,7 +119,7 @@ def torus(thickness: float) -> Mesh:
     tube = np.linspace(0, 2 * np.pi, ALONG + 1)[:, None]
     ring = (1 + thickness * np.cos(tube)) / (1 + thickness)
     y = thickness * np.sin(-tube) / (1 + thickness) * np.ones_like(around)
-    return _lattice(np.stack([ring * np.cos(around), y, -ring * np.sin(around)], axis=-1))
+    return lattice(np.stack([ring * np.cos(around), y, -ring * np.sin(around)], axis=-1))
 
 
 def bumpy(mesh: Mesh, rng: Generator, depth: float) -> Mesh:
@@ -136,7 +136,7 @@ def terrain(rng: Generator, half: float, depth: float) -> Mesh:
     """Uneven ground of the given half width around the origin, y up, its height within the depth."""
     field = np.pad(noise(rng, size=64, octaves=4), ((0, 1), (0, 1)), mode="wrap")
     z, x = np.mgrid[-half:half:65j, -half:half:65j]
-    return _lattice(np.stack([x, depth * (field - 0.5), z], axis=-1))
+    return lattice(np.stack([x, depth * (field - 0.5), z], axis=-1))
 
 
 def random_shape(rng: Generator) -> Mesh:

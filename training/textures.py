@@ -102,3 +102,84 @@ def _veins(rng: Generator) -> Raster:
     u, _ = _axes()
     wave = np.sin(2 * np.pi * (rng.integers(1, 5) * u + rng.uniform(0.5, 2.5) * noise(rng)))
     return (np.abs(wave) ** rng.uniform(0.3, 2)).astype(np.float32)
+
+
+def fine_texture(rng: Generator) -> Raster:
+    """(2 SIZE, 2 SIZE, 3) reflectance with detail down to texels: weave, grain, wood, pebbles, print."""
+    patterns = (_weave, _speckles, _wood, _cells, _print, _fine_stripes)
+    pattern = patterns[rng.integers(len(patterns))](rng)
+    two = np.stack([color(rng), color(rng)])
+    mixed = two[0] * (1 - pattern[..., None]) + two[1] * pattern[..., None]
+    return np.clip(mixed, 0.02, 0.9).astype(np.float32)
+
+
+def relief(rng: Generator) -> Raster:
+    """(2 SIZE, 2 SIZE) heights of a bumped surface, in 0..1: dents, grain, pebbles, weave or ribs."""
+    patterns = (_dents, _grain, _cells, _weave, _ribs)
+    return patterns[rng.integers(len(patterns))](rng)
+
+
+def _fine_axes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    v, u = np.mgrid[: 2 * SIZE, : 2 * SIZE] / (2 * SIZE)
+    return u, v
+
+
+def _dents(rng: Generator) -> Raster:
+    return noise(rng, 2 * SIZE, octaves=2, start=int(rng.integers(6, 20)))
+
+
+def _grain(rng: Generator) -> Raster:
+    return noise(rng, 2 * SIZE, octaves=4, start=int(rng.integers(8, 32)))
+
+
+def _ribs(rng: Generator) -> Raster:
+    u, v = _fine_axes()
+    return (0.5 + 0.5 * np.sin(2 * np.pi * rng.integers(8, 40) * (u if rng.uniform() < 0.5 else v))).astype(
+        np.float32
+    )
+
+
+def _weave(rng: Generator) -> Raster:
+    u, v = _fine_axes()
+    count = int(rng.integers(8, 33))
+    over = (np.floor(u * 2 * count) + np.floor(v * 2 * count)) % 2
+    across, along = np.abs(np.sin(2 * np.pi * count * u)), np.abs(np.sin(2 * np.pi * count * v))
+    return np.where(over > 0, across, 0.6 * along).astype(np.float32)
+
+
+def _speckles(rng: Generator) -> Raster:
+    return (noise(rng, 2 * SIZE, octaves=3, start=int(rng.integers(24, 64))) > rng.uniform(0.4, 0.7)).astype(
+        np.float32
+    )
+
+
+def _wood(rng: Generator) -> Raster:
+    u, v = _fine_axes()
+    rings = rng.integers(4, 12) * u + 0.6 * noise(rng, 2 * SIZE, octaves=3, start=2)
+    fibres = np.repeat(rng.uniform(size=(1, 2 * SIZE)), 2 * SIZE, axis=0)
+    planks = 0.3 * (np.floor(v * rng.integers(1, 6)) % 2)
+    return np.clip(0.6 * (rings % 1) + 0.3 * fibres + planks, 0, 1).astype(np.float32)
+
+
+def _cells(rng: Generator) -> Raster:
+    """The distance to the nearest of many points, which tile (Worley 1996)."""
+    from scipy.spatial import cKDTree
+
+    points = rng.uniform(size=(rng.integers(40, 600), 2))
+    near, _ = cKDTree(points, boxsize=1).query(np.stack(_fine_axes(), axis=-1))
+    return np.clip(near * np.sqrt(len(points)) * 1.2, 0, 1).astype(np.float32)
+
+
+def _print(rng: Generator) -> Raster:
+    """Lines of blocks like words on a page."""
+    line, size = int(rng.integers(4, 12)), 2 * SIZE
+    rows = np.repeat(rng.uniform(size=(size // line + 1, size // 2)) < 0.6, line, axis=0)[:size]
+    ink = np.repeat(rows, 2, axis=1)
+    return (ink & (np.arange(size) % line < 0.6 * line)[:, None]).astype(np.float32)
+
+
+def _fine_stripes(rng: Generator) -> Raster:
+    u, v = _fine_axes()
+    return (((u if rng.uniform() < 0.5 else v) * rng.integers(16, 64)) % 1 < rng.uniform(0.3, 0.7)).astype(
+        np.float32
+    )

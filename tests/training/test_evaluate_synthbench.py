@@ -2,7 +2,7 @@
 
 import gzip
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import PackageNotFoundError
 
 import numpy as np
@@ -13,7 +13,9 @@ from dior_rt.training.evaluation import people, synthbench
 from dior_rt.training.evaluation.benchmarks import open_benchmarks
 from dior_rt.training.evaluation.metrics import psnr
 from dior_rt.training.evaluation.synthbench import FIRST, MOST_COPY, Recipe, make, render_synthbench, staged
+from dior_rt.training.render import view
 from dior_rt.training.scenes import scene
+from dior_rt.training.world import world
 
 BOX = [(x, y, z) for y in (-8, 9) for x in (-2, 2) for z in (-1, 1)]
 SIDES = ("1/1 2/2 4/4 3/3", "5/1 7/2 8/4 6/3", "1/1 3/2 7/4 5/3", "2/1 6/2 8/4 4/3", "1/1 5/2 6/4 2/3")
@@ -80,10 +82,13 @@ def test_a_person_stands_where_and_as_tall_as_asked(makehuman) -> None:
 
 
 def test_scenes_are_none_that_training_can_have() -> None:
-    described = staged(FIRST, with_person=True)
     assert FIRST > 900 * 1_000_000 + 999_999  # render's last seed, and its last scene
-    assert len(described.things) > len(scene(FIRST, 1).things)
-    assert len(staged(FIRST, with_person=False).things) == len(scene(FIRST, 1).things)
+    for number in range(8):
+        described = staged(FIRST, number)
+        without = (scene, world)[number // 2 % 2](FIRST, 1)
+        assert described.kind == without.kind and described.sources[-1].kind == without.sources[-1].kind
+        figure = len(described.things) - len(without.things)
+        assert figure >= 3 if number % 2 else figure == 0
 
 
 def test_pairs_differ_much_are_resumed_and_can_be_read(tmp_path) -> None:
@@ -104,6 +109,36 @@ def test_pairs_differ_much_are_resumed_and_can_be_read(tmp_path) -> None:
         assert np.array_equal(strokes.light[drawn], task.target_lumi[drawn])
         assert not strokes.light[~drawn].any()
         assert task.control("dense").mask.all()
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_only_the_sources_that_shine_are_rendered_in_full(number, monkeypatch) -> None:
+    """What a pair shows is nothing of the preview's noise: of sources it uses, only full renders."""
+    asked = []
+
+    def spied(*args, **options):
+        asked.append((args, options))
+        return view(*args, **options)
+
+    monkeypatch.setattr(synthbench, "view", spied)
+    recipe = Recipe(1, seed=4, resolution=24, samples=2, speckle=255.0)
+    task = make(number, recipe)
+    (stage, described, camera, scene_number, *_), _ = asked[-2]
+    (_, in_full, *_), options = asked[-1]
+    assert options["denoised"] and 0 < len(in_full.sources) <= len(described.sources)
+    preview = view(stage, described, camera, scene_number, 24, synthbench.PREVIEW)
+    seed = synthbench.differing(preview)
+    lit = synthbench.used(preview, seed)
+    dark = preview.images.copy()
+    dark[lit] = 0  # of the sources that are used; no other may reach the pictures
+    sample, *_ = synthbench.shown(replace(preview, images=dark), seed)
+    assert not sample.photo.any() and not sample.relit.any()
+    assert [described.sources[k] for k in np.flatnonzero(lit)] == list(in_full.sources)
+    full = view(stage, in_full, camera, scene_number, 24, 2, denoised=True)
+    images, lumi = preview.images.copy(), preview.lumi.copy()
+    images[lit], lumi[lit] = full.images, full.lumi
+    _, source, truth = synthbench.shown(replace(preview, images=images, lumi=lumi), seed)
+    assert np.array_equal(source, task.source) and np.array_equal(truth, task.truth)
 
 
 def test_noise_that_does_not_go_is_told(monkeypatch) -> None:

@@ -142,7 +142,7 @@ def render_all(sources, colors, samples: int) -> np.ndarray:
         "integrator": {"type": "direct", "hide_emitters": True},
         "sensor": render._sensor(CAMERA, SIZE),
         **emitters,
-        **Stage.load((WALL,)).white,
+        **Stage.load((WALL,)).white.things,
     }
     return np.array(mi.render(mi.load_dict(described), spp=samples, seed=0), np.float32)[..., :3]
 
@@ -229,7 +229,7 @@ def test_a_view_holds_every_source_at_unit_mean_and_survives_the_disk(tmp_path) 
 def test_shards_share_the_work_and_a_second_run_renders_nothing(tmp_path, monkeypatch) -> None:
     rendered = []
 
-    def counted(stage, described, camera, number):
+    def counted(stage, described, camera, number, denoised):
         rendered.append(number)
         return view(stage, described, camera, number, resolution=4, samples=1)
 

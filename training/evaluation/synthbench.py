@@ -8,7 +8,10 @@
 
 Copying the source scores at most MOST_COPY dB on every pair. Scene numbers lie above all those that
 `dior-rt train render` can reach, so no geometry was ever trained on; in every second pair stands a human
-figure, a kind of thing that training has none of.
+figure, a kind of thing that training has none of. Half of the pairs are plain scenes, half are of the world.
+
+Lights are decided on by a preview of few rays; only sources that are lit in one of the two pictures are then
+rendered in full.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from typing import Final
 
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, replacing
@@ -28,23 +32,27 @@ from dior_rt.pictures import Photo, write_photo
 from dior_rt.records import parse, read_json
 from dior_rt.strokes import write_lumi
 from dior_rt.training.evaluation.benchmarks import HEAD, LAST
+from dior_rt.training.evaluation.metrics import Photo as Shown
 from dior_rt.training.evaluation.metrics import psnr, speckle
 from dior_rt.training.evaluation.people import person
 from dior_rt.training.evaluation.tasks import OPS, Task
-from dior_rt.training.render import Stage, mitsuba, view
-from dior_rt.training.scenes import Scene, scene
-from dior_rt.training.triplets import pair
+from dior_rt.training.render import DOMAINS, Stage, View, lit, mitsuba, view
+from dior_rt.training.scenes import Camera, Scene
+from dior_rt.training.triplets import DIMMEST, Pair, pair, random_lights
 
 MOST_COPY: Final = 15.0  # dB
 DRAWS: Final = 200  # of lights in a scene, before the next scene is tried
 FIRST: Final = 901_000_000  # the first scene number; `render` has those below
 STRIDE: Final = 1000  # scene numbers from pair to pair; of seeds, 1000 pairs
-FORMAT: Final = 1
+FORMAT: Final = 2
+PREVIEW: Final = 2  # rays a pixel and source
+MARGIN: Final = 0.5  # dB that a preview has to stay below MOST_COPY
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a SynthBench is made from. resolution: pixels a side. samples: rays a pixel and source.
+    """What a SynthBench is made from. resolution: pixels a side. samples: rays a pixel and source, before
+    denoising.
 
     speckle: the most that either picture may have, in 0..255; photos of 128 x 128 pixels have 5 to 8.
     """
@@ -52,7 +60,7 @@ class Recipe:
     pairs: int = 600
     seed: int = 0
     resolution: int = 128
-    samples: int = 32
+    samples: int = 16
     speckle: float = 8.0
     format: int = FORMAT
 
@@ -86,31 +94,73 @@ def make(number: int, recipe: Recipe) -> Task:
     little noise. Raises InputError where there is none."""
     first = FIRST + recipe.seed * 1_000 * STRIDE + number * STRIDE
     for scene_number in range(first, first + STRIDE):
-        described = staged(scene_number, with_person=number % 2 == 1)
-        seen = view(
-            Stage.load(described.things),
-            described,
-            described.cameras[0],
-            scene_number,
-            recipe.resolution,
-            recipe.samples,
-        )
-        rng = np.random.default_rng([scene_number, 5])
-        for _ in range(DRAWS):
-            sample = pair(rng, seen, "replace")
-            source, truth = (OPS.encode_srgb(linear, np.uint8) for linear in (sample.photo, sample.relit))
-            if psnr(source, truth) <= MOST_COPY and max(map(speckle, (source, truth))) <= recipe.speckle:
-                mask = OPS.sparsify(sample.target, "strokes", number).mask
-                return Task(f"{number:04d}", source, truth, sample.source, sample.target, mask, seed=number)
+        described = staged(scene_number, number)
+        camera = described.cameras[0]
+        stage = Stage.load(described.things)
+        described = lit(stage, described, camera)
+        if not described.sources:
+            continue
+        preview = view(stage, described, camera, scene_number, recipe.resolution, PREVIEW)
+        seed = differing(preview)
+        if seed is None:
+            continue
+        seen = in_full(stage, described, camera, preview, used(preview, seed), recipe)
+        sample, source, truth = shown(seen, seed)
+        if psnr(source, truth) <= MOST_COPY and max(map(speckle, (source, truth))) <= recipe.speckle:
+            mask = OPS.sparsify(sample.target, "strokes", number).mask
+            return Task(f"{number:04d}", source, truth, sample.source, sample.target, mask, seed=number)
     raise InputError(f"Pair {number} finds no scene without noise; take more samples than {recipe.samples}.")
 
 
-def staged(number: int, with_person: bool) -> Scene:
-    """The scene of that number by one camera, with a human figure in front or without."""
-    described = scene(number, cameras=1)
-    if not with_person:
+def shown(seen: View, seed: list[int]) -> tuple[Pair, Shown, Shown]:
+    """The pair of a view that a seed draws, and its pictures as they are shown."""
+    sample = pair(np.random.default_rng(seed), seen, "replace")
+    return sample, *(OPS.encode_srgb(linear, np.uint8) for linear in (sample.photo, sample.relit))
+
+
+def differing(preview: View) -> list[int] | None:
+    """The first seed whose lights differ enough by a preview, or None."""
+    for draw in range(DRAWS):
+        seed = [preview.seed, 5, draw]
+        _, source, truth = shown(preview, seed)
+        if psnr(source, truth) <= MOST_COPY - MARGIN:
+            return seed
+    return None
+
+
+def used(preview: View, seed: list[int]) -> NDArray[np.bool_]:
+    """(sources,) which are lit in either picture of the pair that the seed draws."""
+    rng = np.random.default_rng(seed)
+    usable = preview.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
+    return (random_lights(rng, usable) + random_lights(rng, usable)).any(axis=1)
+
+
+def in_full(
+    stage: Stage, described: Scene, camera: Camera, preview: View, chosen: NDArray[np.bool_], recipe: Recipe
+) -> View:
+    """The preview with the chosen sources rendered in full, and denoised."""
+    sources = tuple(described.sources[k] for k in np.flatnonzero(chosen))
+    full = view(
+        stage,
+        replace(described, sources=sources),
+        camera,
+        preview.seed,
+        recipe.resolution,
+        recipe.samples,
+        denoised=True,
+    )
+    images, lumi = preview.images.copy(), preview.lumi.copy()
+    images[chosen], lumi[chosen] = full.images, full.lumi
+    return replace(preview, images=images, lumi=lumi)
+
+
+def staged(scene_number: int, number: int) -> Scene:
+    """A scene for the pair of that number, by one camera: with a human figure in front if it is odd, of the
+    world if its half is."""
+    described = DOMAINS["world" if number // 2 % 2 else "plain"].scene(scene_number, 1)
+    if number % 2 == 0:
         return described
-    rng: Generator = np.random.default_rng([number, 6])
+    rng: Generator = np.random.default_rng([scene_number, 6])
     at = np.array([rng.uniform(-0.6, 0.6), 0.0, rng.uniform(0.1, 0.9)])
     figure = person(rng, rng.uniform(1.3, 1.7), rng.uniform(-0.9, 0.9), at)
     return replace(described, things=(*described.things, *figure))
