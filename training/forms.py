@@ -53,7 +53,7 @@ def vessel(rng: Generator) -> Mesh:
     outer = np.stack([radius, (2 * height - 1) * tall], axis=1)
     inner = outer * [1, 0.96] - [rng.uniform(0.04, 0.1), 0]
     foot, bottom = [[0.0, -tall]], [[0.0, float(inner[0, 1])]]
-    return turned(np.concatenate([bottom, inner, outer[::-1], foot])[::-1])
+    return turned(np.concatenate([bottom, inner, outer[::-1], foot]))
 
 
 def column(rng: Generator) -> Mesh:

@@ -1,7 +1,7 @@
 """Environment light: procedural panoramas of radiance, drawn from a seed. Linear, of mean 1.
 
 A panorama (H, 2H, 3) is equirectangular as Mitsuba's `envmap` has it: rows from the zenith, y up, to the
-nadir, columns once around; the middle column looks along -z, the first and the last along +z.
+nadir, columns once around, from -z over +x to +z in the middle, and back over -x.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DUSK = np.array([1.0, 0.55, 0.25])
 def rays(rows: int = ROWS) -> Rays:
     """(rows, 2 rows, 3) the unit vectors to a panorama's pixels."""
     down = (np.arange(rows) + 0.5) / rows * np.pi
-    around = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2 * np.pi
+    around = (np.arange(2 * rows) + 0.5) / rows * np.pi
     theta, phi = np.meshgrid(down, around, indexing="ij")
     return np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
 
