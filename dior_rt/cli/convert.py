@@ -12,6 +12,8 @@ from dior_rt.cli import options
 from dior_rt.cli.extras import needs_extra
 from dior_rt.cli.text import table
 from dior_rt.errors import InputError
+from dior_rt.files import reason
+from dior_rt.schedule import ShiftSchedule
 
 Precision = Literal["fp32", "fp16", "int8", "int4"]
 
@@ -37,6 +39,10 @@ def export(
     noise_scale: Annotated[
         float | None,
         typer.Option(min=0, help="A checkpoint of training: how strong its starting noise is [1]."),
+    ] = None,
+    shift: Annotated[
+        float | None,
+        typer.Option(help="A checkpoint of training: its schedule's; more spends more steps near noise [8]."),
     ] = None,
     few_steps: Annotated[
         int | None,
@@ -78,9 +84,9 @@ def export(
           --few-steps 8 -o bundles/qwen-fast
     """
     if (source / "model_index.json").is_file():
-        if guidance is not None or noise_scale is not None:
+        if any(option is not None for option in (guidance, noise_scale, shift)):
             raise InputError(
-                "Qwen-Image-Edit has its own guidance and noise; those options are for training's."
+                "Qwen-Image-Edit has its own guidance, noise and schedule; those options are for training's."
             )
         with needs_extra("qwen", command="export"):
             from dior_rt.export.qwen.bundle import Recipe, export_qwen
@@ -112,6 +118,7 @@ def export(
                 out,
                 lora=Path(lora[0]) if lora else None,
                 recipe=MiniRecipe(
+                    schedule=_schedule(8.0 if shift is None else shift),
                     steps=steps,
                     guidance=1.0 if guidance is None else guidance,
                     noise_scale=1.0 if noise_scale is None else noise_scale,
@@ -120,6 +127,13 @@ def export(
                 overwrite=overwrite,
             )
     table([(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()])
+
+
+def _schedule(shift: float) -> ShiftSchedule:
+    try:
+        return ShiftSchedule(shift)
+    except ValueError as error:
+        raise InputError(f"No schedule can be so: {reason(error)}.") from error
 
 
 def _path_and_strength(text: str) -> tuple[Path, float]:

@@ -13,6 +13,8 @@ from onnx import TensorProto, helper, numpy_helper
 from peft import LoraConfig, get_peft_model
 from safetensors.torch import save_file
 
+from dior_rt.bundle import read_bundle
+from dior_rt.cli import run as run_command
 from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError, InputError
 from dior_rt.export import mini as export
@@ -153,6 +155,20 @@ def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
     assert bundle.manifest.grid == dataclasses.replace(recipe.grid, multiple=network.config.patch)
     feeds = random_feeds(8, 12, seed=3)
     assert relative_error(run(open_graphs(bundle), feeds), evaluate(adapted.eval(), feeds)) < 1e-5
+
+
+def test_the_command_says_how_the_bundle_runs(network, tmp_path, capfd):
+    save_network(network, tmp_path / "model.safetensors")
+    made = ["export", str(tmp_path), "--steps", "2", "-o", str(tmp_path / "b"), "--shift"]
+    for shift in ("0", "-1", "nan", "1e9"):
+        assert run_command([*made, shift]) == 2
+        said = capfd.readouterr().err
+        assert "shift must be a positive number" in said and said.count("\n") == 1
+    assert not (tmp_path / "b").exists()
+    assert run_command([*made, "3.5", "--guidance", "1.5", "--noise-scale", "0"]) == 0
+    manifest = read_bundle(tmp_path / "b").manifest
+    assert (manifest.schedule, manifest.steps) == (ShiftSchedule(3.5), 2)
+    assert (manifest.guidance, manifest.noise_scale) == (1.5, 0)
 
 
 def spoiled(network, by):
