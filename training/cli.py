@@ -233,6 +233,52 @@ def evaluate(
     typer.echo(to_json(evaluations) if as_json else markdown(evaluations))
 
 
+@app.command()
+def maps(
+    renders: Annotated[Path, typer.Argument(help="Folder of renders.")],
+    out: Annotated[Path, typer.Option(help="Folder for the views; what is there already is kept.")],
+    views: Annotated[int, typer.Option(min=1, help="How many, the first camera's of as many scenes.")] = 250,
+    first: Annotated[int, typer.Option(min=0, help="The scene to begin with.")] = 0,
+) -> None:
+    """Render irradiance, shading and Phong maps of renders, in the Lumi map's place, for `ablation`."""
+    from dior_rt.training.maps import render_maps
+
+    with typer.progressbar(length=views, label="views") as bar:
+        render_maps(renders, out, views, first, progress=lambda done, total: bar.update(1))
+
+
+@app.command()
+def ablation(
+    maps: Annotated[Path, typer.Argument(help="Folder of `maps` to train on.")],
+    held_out: Annotated[Path, typer.Argument(help="Folder of `maps` of other renders, to judge by.")],
+    renders: Annotated[Path, typer.Argument(help="What MAPS was made of; its other scenes become photos.")],
+    out: Annotated[Path, typer.Option(help="Folder of the networks and the report; resumable.")],
+    steps: Annotated[int, typer.Option(min=1, help="Of stage 1.")] = 700,
+    lora_steps: Annotated[int, typer.Option(min=1)] = 150,
+    batch: Annotated[int, typer.Option(min=2, help="Even; in stage 2 half of it is real pairs.")] = 16,
+    precision: Precision = "no",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Train small networks on each kind of map, and on Lumi maps without stage 2, and compare them."""
+    from dataclasses import replace
+
+    from dior_rt.training.ablation import Budget, ablate
+    from dior_rt.training.evaluation.report import markdown, write_report
+
+    budget = Budget()
+    stage1 = replace(budget.stage1, steps=steps, batch=batch, precision=precision, seed=seed)
+    lora = replace(budget.lora, steps=lora_steps, batch=batch, precision=precision, seed=seed + 1)
+
+    def tell(training: str, step: int, loss: float) -> None:
+        if step % 50 == 0:
+            typer.echo(f"{training}: step {step}, loss {loss:.4f}", err=True)
+
+    budget = replace(budget, stage1=stage1, lora=lora)
+    evaluation, examples = ablate(maps, held_out, renders, out, budget, tell)
+    write_report(out, [evaluation], examples)
+    typer.echo(markdown([evaluation]))
+
+
 class _Bar:
     """A progress bar on a terminal; elsewhere a line every hundred steps."""
 

@@ -25,7 +25,7 @@ from dior_rt.files import make_folder
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.network import WEIGHTS, Config, Mini, save_network
 from dior_rt.training.state import Average, State
-from dior_rt.training.triplets import Batches, load_views
+from dior_rt.training.triplets import GRIDS, Batches, Grids, load_views
 
 STATE: Final = "state.safetensors"  # what a run resumes from
 
@@ -44,7 +44,7 @@ class Plan:
     clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. silent: the
     share of samples whose noise is 0, as it is where sampling starts from the noise's mean. own: how the
     error of the photo's own light counts beside that of x0. precision: as accelerate names it. compiled: by
-    torch.compile, which takes minutes and then nearly halves a step's time on CPUs.
+    torch.compile, which takes minutes and then nearly halves a step's time on CPUs. grids: see `Batches`.
     """
 
     steps: int
@@ -56,12 +56,13 @@ class Plan:
     weight_decay: float = 0.02
     clip: float = 1.0
     shift: float = 8.0
-    always_noise: float = 0.75
-    silent: float = 0.5
+    always_noise: float = 0.85
+    silent: float = 0.7
     own: float = 0.25
     seed: int = 0
     precision: Literal["no", "bf16"] = "no"
     compiled: bool = False
+    grids: Grids = GRIDS
     save_every: int = 200
 
     def rate_at(self, step: int) -> float:
@@ -98,7 +99,7 @@ def fit_lora(
 def rendered(renders: Path, plan: Plan) -> Stream:
     """Triplets from a folder of renders; raises InputError where it holds none."""
     views = load_views(renders)
-    return lambda start, rank: Batches(views, plan.batch, plan.seed, start, rank=rank)
+    return lambda start, rank: Batches(views, plan.batch, plan.seed, start, rank=rank, grids=plan.grids)
 
 
 def flow_loss(network: nn.Module, batch: Batch, sigma: Tensor, noise: Tensor, own: float = 0.0) -> Tensor:

@@ -33,11 +33,12 @@ from dior_rt.training.textures import rainbow
 
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
 Raster = NDArray[np.float32]
+Grids = tuple[tuple[int, int], ...]  # (rows, columns) in cells
 
-GRIDS = ((64, 64), (56, 80), (80, 56))
+GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
 KINDS = ("change", "local", "replace", "keep")
-KIND_SHARES = (0.25, 0.3, 0.33, 0.12)
-DABS = {"change": 0.2, "local": 0.35, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
+KIND_SHARES = (0.2, 0.38, 0.32, 0.1)
+DABS = {"change": 0.15, "local": 0.4, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
 DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
@@ -239,14 +240,22 @@ class Mix:
 class Batches(IterableDataset[dict[str, Tensor]]):
     """An endless stream of batches: the network's inputs, `x0` and `own`. The n-th is the same on every run.
 
-    start: the number of the first batch. rank: of this process, where several train together.
+    start: the number of the first batch. rank: of this process, where several train together. grids: a
+    batch's light grid is one of these.
     """
 
     def __init__(
-        self, views: list[View], batch: int, seed: int, start: int = 0, shares: Mix = Mix(), rank: int = 0
+        self,
+        views: list[View],
+        batch: int,
+        seed: int,
+        start: int = 0,
+        shares: Mix = Mix(),
+        rank: int = 0,
+        grids: Grids = GRIDS,
     ) -> None:
         super().__init__()
-        self.views, self.batch, self.shares = views, batch, shares
+        self.views, self.batch, self.shares, self.grids = views, batch, shares, grids
         self.seed, self.rank, self.start = seed, rank, start
 
     def __iter__(self) -> Iterator[dict[str, Tensor]]:
@@ -256,8 +265,9 @@ class Batches(IterableDataset[dict[str, Tensor]]):
             number += 1
 
     def make(self, rng: Generator) -> dict[str, Tensor]:
-        grid = GRIDS[rng.integers(len(GRIDS))]
-        samples = [self._sample(rng, grid) for _ in range(self.batch)]
+        grid = self.grids[rng.integers(len(self.grids))]
+        # Each sample draws for itself: what one view needs more or less does not change the others.
+        samples = [self._sample(own, grid) for own in rng.spawn(self.batch)]
         return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
 
     def _sample(self, rng: Generator, grid: tuple[int, int]) -> dict[str, Tensor]:
