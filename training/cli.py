@@ -182,7 +182,7 @@ def synthbench(
     pairs: Annotated[int, typer.Option(min=1, max=1000)] = 600,
     seed: Annotated[int, typer.Option(min=0, max=90, help="Of other seeds, other scenes.")] = 0,
     resolution: Annotated[int, typer.Option(min=16, help="Pixels a side.")] = 128,
-    samples: Annotated[int, typer.Option(min=1, help="Rays a pixel and source, before denoising.")] = 16,
+    samples: Annotated[int, typer.Option(min=1, help="Rays a pixel and source, before denoising.")] = 8,
     shard: Annotated[str, typer.Option(help="i/n: this process's share; run one process a core.")] = "0/1",
 ) -> None:
     """Render SynthBench: pairs of very different light, with true maps, for `eval`. Resumable."""

@@ -113,7 +113,7 @@ def test_pairs_differ_much_are_resumed_and_can_be_read(tmp_path) -> None:
 
 @pytest.mark.parametrize("number", [0, 2])
 def test_only_the_sources_that_shine_are_rendered_in_full(number, monkeypatch) -> None:
-    """What a pair shows is nothing of the preview's noise: of sources it uses, only full renders."""
+    """And the lights are those that the preview chose, though all other sources are dark now."""
     asked = []
 
     def spied(*args, **options):
@@ -126,18 +126,19 @@ def test_only_the_sources_that_shine_are_rendered_in_full(number, monkeypatch) -
     (stage, described, camera, scene_number, *_), _ = asked[-2]
     (_, in_full, *_), options = asked[-1]
     assert options["denoised"] and 0 < len(in_full.sources) <= len(described.sources)
-    preview = view(stage, described, camera, scene_number, 24, synthbench.PREVIEW)
+    preview = view(stage, described, camera, scene_number, 12, synthbench.PREVIEW)
     seed = synthbench.differing(preview)
-    lit = synthbench.used(preview, seed)
-    dark = preview.images.copy()
-    dark[lit] = 0  # of the sources that are used; no other may reach the pictures
-    sample, *_ = synthbench.shown(replace(preview, images=dark), seed)
-    assert not sample.photo.any() and not sample.relit.any()
-    assert [described.sources[k] for k in np.flatnonzero(lit)] == list(in_full.sources)
+    chosen = synthbench.used(preview, seed)
+    assert [described.sources[k] for k in np.flatnonzero(chosen)] == list(in_full.sources)
+    without = preview.images.copy()
+    without[chosen] = 0
+    sample, *_ = synthbench.shown(replace(preview, images=without), seed)
+    assert not sample.photo.any() and not sample.relit.any()  # no other source reaches the pictures
+    every = view(stage, described, camera, scene_number, 24, 2, denoised=True)
     full = view(stage, in_full, camera, scene_number, 24, 2, denoised=True)
-    images, lumi = preview.images.copy(), preview.lumi.copy()
-    images[lit], lumi[lit] = full.images, full.lumi
-    _, source, truth = synthbench.shown(replace(preview, images=images, lumi=lumi), seed)
+    images, lumi = every.images.copy(), every.lumi.copy()
+    images[chosen], lumi[chosen] = full.images, full.lumi  # the renderer's noise goes by a source's place
+    _, source, truth = synthbench.shown(replace(every, images=images, lumi=lumi), seed)
     assert np.array_equal(source, task.source) and np.array_equal(truth, task.truth)
 
 

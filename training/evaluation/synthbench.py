@@ -45,7 +45,7 @@ DRAWS: Final = 200  # of lights in a scene, before the next scene is tried
 FIRST: Final = 901_000_000  # the first scene number; `render` has those below
 STRIDE: Final = 1000  # scene numbers from pair to pair; of seeds, 1000 pairs
 FORMAT: Final = 2
-PREVIEW: Final = 2  # rays a pixel and source
+PREVIEW: Final = 2  # rays a pixel and source, of half as many pixels a side
 MARGIN: Final = 0.5  # dB that a preview has to stay below MOST_COPY
 
 
@@ -60,7 +60,7 @@ class Recipe:
     pairs: int = 600
     seed: int = 0
     resolution: int = 128
-    samples: int = 16
+    samples: int = 8
     speckle: float = 8.0
     format: int = FORMAT
 
@@ -100,7 +100,7 @@ def make(number: int, recipe: Recipe) -> Task:
         described = lit(stage, described, camera)
         if not described.sources:
             continue
-        preview = view(stage, described, camera, scene_number, recipe.resolution, PREVIEW)
+        preview = view(stage, described, camera, scene_number, recipe.resolution // 2, PREVIEW)
         seed = differing(preview)
         if seed is None:
             continue
@@ -138,18 +138,11 @@ def used(preview: View, seed: list[int]) -> NDArray[np.bool_]:
 def in_full(
     stage: Stage, described: Scene, camera: Camera, preview: View, chosen: NDArray[np.bool_], recipe: Recipe
 ) -> View:
-    """The preview with the chosen sources rendered in full, and denoised."""
-    sources = tuple(described.sources[k] for k in np.flatnonzero(chosen))
-    full = view(
-        stage,
-        replace(described, sources=sources),
-        camera,
-        preview.seed,
-        recipe.resolution,
-        recipe.samples,
-        denoised=True,
-    )
-    images, lumi = preview.images.copy(), preview.lumi.copy()
+    """The previewed view with the chosen sources rendered in full, and denoised; the others are dark."""
+    lamps = replace(described, sources=tuple(described.sources[k] for k in np.flatnonzero(chosen)))
+    full = view(stage, lamps, camera, preview.seed, recipe.resolution, recipe.samples, denoised=True)
+    images = np.zeros((chosen.size, *full.images.shape[1:]), np.float16)
+    lumi = images.copy()
     images[chosen], lumi[chosen] = full.images, full.lumi
     return replace(preview, images=images, lumi=lumi)
 
