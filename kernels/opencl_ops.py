@@ -11,7 +11,7 @@ import pyopencl as cl
 from dior_rt.kernels import draw
 from dior_rt.kernels.color import decode_table, encode_table
 from dior_rt.kernels.ops import Grid, Ops
-from dior_rt.kernels.resample import FAINTEST, bands
+from dior_rt.kernels.resample import FAINTEST, bands, spline_taps
 from dior_rt.kernels.session import Session
 from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, SIGMA
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 SAMPLES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
 #: Pixels in a band: a few megabytes, and enough work to make a launch's cost vanish.
 BAND = 1 << 22
+#: Registers of pixels in a cell: of fewer, what the last of them has too much would cost more than a fifth.
+FEW = 4
 
 
 class OpenCLOps(Ops):
@@ -145,14 +147,17 @@ class OpenCLOps(Ops):
         session, (height, width) = self._session, photo.shape[:2]
         rows, columns = nodes.shape[0] - 2, nodes.shape[1] - 2
         result = np.empty(photo.shape, photo.dtype)
-        kernel = self._kernel("transfer", photo.dtype)
         tables = self._decode_table(photo.dtype), self._encode_table(photo.dtype)
-        given = session.input(nodes), *tables
+        narrow = width < columns * session.lanes * FEW
+        kernel = self._kernel("transfer_narrow" if narrow else "transfer", photo.dtype)
+        light = _by_pixel(nodes, width) if narrow else (nodes,)
+        given = [*map(session.input, light), *tables]
+        count, sides = (width, ()) if narrow else (columns, (columns,))
         for band in bands(height, width, BAND):
             with session.output(result[band]) as out:
-                place = height, width, rows, columns, band.start
-                count = band.stop - band.start
-                session.launch(kernel, columns, count, session.input(photo[band]), *given, out, *place)
+                place = height, width, rows, *sides, band.start
+                taken = session.input(photo[band])
+                session.launch(kernel, count, band.stop - band.start, taken, *given, out, *place)
         return result
 
     def _kernel(self, name: str, dtype: npt.DTypeLike = np.uint8, **defines: str) -> cl.Kernel:
@@ -183,6 +188,14 @@ class OpenCLOps(Ops):
 
     def _encode_table(self, dtype: np.dtype) -> cl.Buffer | None:
         return None if dtype == np.float32 else self._session.constant(encode_table(dtype).entry)
+
+
+def _by_pixel(nodes: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
+    """Of every pixel of a row the nodes before, at and after it, (rows + 2, 3, 4, width), and the weights of
+    these three, (3, width)."""
+    column, across = spline_taps(width, nodes.shape[1] - 2)
+    planes = np.ascontiguousarray(nodes.transpose(0, 2, 1))  # (rows + 2, 4, columns + 2)
+    return np.stack([planes.take(column + m, axis=2) for m in range(3)], 1), across
 
 
 def _whole(dtype: np.dtype) -> str:

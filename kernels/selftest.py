@@ -45,7 +45,7 @@ def _cases(dtypes: tuple[npt.DTypeLike, ...]) -> Iterator[Case]:
     rng = np.random.default_rng(20)
     light = rng.random((*SIZE, 3), np.float32)
     mask = np.where(rng.random(SIZE) < 0.3, rng.random(SIZE, np.float32), 0)
-    source, relit = rng.random((2, *GRID, 3), np.float32)
+    narrow = rng.random((2, GRID[0], 60, 3), np.float32)  # cells of two pixels
     strokes = [
         Stroke(((3.0, 4.0), (40.0, 20.0), (10.0, 33.0)), 6.0, (1.0, 0.5, 0.2), 2.0, 0.5),
         Stroke(((50.0, 30.0),), 0.3, (0.0, 1.0, 4.0)),
@@ -57,7 +57,9 @@ def _cases(dtypes: tuple[npt.DTypeLike, ...]) -> Iterator[Case]:
         yield f"decode_srgb of {dtype}", partial(Ops.decode_srgb, picture=picture), 2e-6
         yield f"encode_srgb to {dtype}", partial(Ops.encode_srgb, linear=light, dtype=dtype), exact
         yield f"reduce_photo of {dtype}", partial(Ops.reduce_photo, picture=picture, grid=GRID), 1e-5
-        yield f"transfer of {dtype}", partial(Ops.transfer, photo=picture, source=source, relit=relit), step
+        for columns, (source, relit) in {60: narrow, 2: narrow[:, :, :2]}.items():
+            relight = partial(Ops.transfer, photo=picture, source=source, relit=relit)
+            yield f"transfer of {dtype} from {columns} columns", relight, step
     yield "reduce_strokes", partial(Ops.reduce_strokes, light=light, mask=mask, grid=GRID), 1e-5
     yield "draw_strokes", partial(Ops.draw_strokes, strokes=strokes, size=SIZE), 1e-4
     yield "sparsify to strokes", partial(Ops.sparsify, lumi=light, mode="strokes", seed=1), 0

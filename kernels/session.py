@@ -40,7 +40,7 @@ def _translated(method: Callable[P, T]) -> Callable[P, T]:
 
 
 class Session:
-    """Safe to use from several threads: kernels are objects of one call, and what is cached is behind a lock.
+    """Safe to use from several threads: each has its own kernels, and what they share is behind a lock.
 
     Where the device shares the host's memory, buffers are the arrays themselves and nothing is copied.
     """
@@ -57,7 +57,7 @@ class Session:
         except cl.Error as error:
             raise KernelError(f"{self.name} cannot be opened ({error})") from error
         self._run = CPU_RUN if device.type == "cpu" else 1
-        self._lock = threading.Lock()
+        self._lock, self._local = threading.Lock(), threading.local()
         self._programs: dict[tuple[str, ...], cl.Program] = {}
         self._constants: dict[int, tuple[np.ndarray, cl.Buffer]] = {}
 
@@ -74,7 +74,16 @@ class Session:
                 text = "\n".join((FOLDER / source).read_text("utf-8") for source in SOURCES)
                 program = cl.Program(self._context, text).build(["-cl-std=CL1.2", *options])
                 self._programs[options] = program
-        return cl.Kernel(program, name)
+        kernels = self._kernels_of_thread()
+        if (name, options) not in kernels:
+            kernels[name, options] = cl.Kernel(program, name)
+        return kernels[name, options]
+
+    def _kernels_of_thread(self) -> dict[tuple[str, tuple[str, ...]], cl.Kernel]:
+        """A kernel keeps its arguments, so every thread has its own. To make one takes a millisecond."""
+        if not hasattr(self._local, "kernels"):
+            self._local.kernels = {}
+        return self._local.kernels
 
     @_translated
     def launch(self, kernel: cl.Kernel, count: int, rows: int, *args: cl.Buffer | int | None) -> None:

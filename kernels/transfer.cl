@@ -29,12 +29,24 @@ inline float relit(float x, float q) { return x + (x + EPSILON) * (q * (q + 2.0f
 #define LIGHTNESS(pixel) (unit(0.25f * (pixel[0] + 2.0f * pixel[1] + pixel[2])) * (1.0f / SIGMA))
 #endif
 
-/* Relight the pixel at `from` into `to`: at `offset` from the middle of its cell along the row, amid the nodes `near`
- * of its own cell and the eight around, whose light has been multiplied by their vertical weights `down`. A call would
- * not be vectorised. */
+/* Relight the pixel at `from` into `to` by r, s, t: sums of sqrt(R) - 1 by weights whose sum is `total`. */
 __attribute__((always_inline)) inline void relight(__global const SAMPLE *from, __global SAMPLE *to,
                                                    __global const float *light_of, __global const int *code_of,
-                                                   const float4 *near, const float *down, float offset) {
+                                                   float r, float s, float t, float total) {
+  float scale = 1.0f / total;
+  SAMPLE red = ENCODE(relit(DECODE(from[0]), r * scale));
+  SAMPLE green = ENCODE(relit(DECODE(from[1]), s * scale));
+  SAMPLE blue = ENCODE(relit(DECODE(from[2]), t * scale));
+  to[0] = red;
+  to[1] = green;
+  to[2] = blue;
+}
+
+/* The same at `offset` from the middle of its cell along the row, amid the nodes `near` of its own cell and the eight
+ * around, whose light has been multiplied by their vertical weights `down`. A call would not be vectorised. */
+__attribute__((always_inline)) inline void relight_amid(__global const SAMPLE *from, __global SAMPLE *to,
+                                                        __global const float *light_of, __global const int *code_of,
+                                                        const float4 *near, const float *down, float offset) {
   float g = LIGHTNESS(from), across[3], total = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
   spline(offset, across);
 #pragma unroll
@@ -46,17 +58,11 @@ __attribute__((always_inline)) inline void relight(__global const SAMPLE *from, 
     s += weight * near[k].y;
     t += weight * near[k].z;
   }
-  float scale = 1.0f / total;
-  SAMPLE red = ENCODE(relit(DECODE(from[0]), r * scale));
-  SAMPLE green = ENCODE(relit(DECODE(from[1]), s * scale));
-  SAMPLE blue = ENCODE(relit(DECODE(from[2]), t * scale));
-  to[0] = red;
-  to[1] = green;
-  to[2] = blue;
+  relight(from, to, light_of, code_of, r, s, t, total);
 }
 
 /* Item (k, y): row y of a band whose first row in the photo is `top`, in the cells k * run .. of that row. nodes:
- * (rows + 2, columns + 2) of (sqrt(R) - 1, lightness / SIGMA), the border repeated. */
+ * (rows + 2, columns + 2) of (sqrt(R) - 1, lightness / SIGMA), the border repeated. A cell has LANES pixels or more. */
 __kernel void transfer(__global const SAMPLE *restrict photo, __global const float4 *restrict nodes,
                        __global const float *restrict light_of, __global const int *restrict code_of,
                        __global SAMPLE *restrict result,
@@ -77,14 +83,43 @@ __kernel void transfer(__global const SAMPLE *restrict photo, __global const flo
     __global SAMPLE *restrict to = result + start;
     /* As many at a time as the device has lanes, the last of them twice if need be: no remainder is left to be done
      * one by one. Of wide cells, a quarter of the time went there. */
-    for (int x = 0; x < count && count >= LANES; x += LANES) {
+    for (int x = 0; x < count; x += LANES) {
       int at = x + LANES < count ? x : count - LANES;
 #pragma clang loop vectorize_width(LANES) interleave_count(1)
-      for (int k = at; k < at + LANES; ++k) relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down,
-                                                    offset + step * k);
+      for (int k = at; k < at + LANES; ++k) relight_amid(from + 3 * k, to + 3 * k, light_of, code_of, near, down,
+                                                         offset + step * k);
     }
-#pragma clang loop vectorize(disable)
-    for (int k = 0; k < count && count < LANES; ++k)
-      relight(from + 3 * k, to + 3 * k, light_of, code_of, near, down, offset + step * k);
+  }
+}
+
+/* The same where cells are narrow, whose last lanes would often be idle: here a register of pixels may lie in several
+ * cells. nodes: (rows + 2, 3, 4, width), for every pixel of a row those before, at and after its column, a row a
+ * quantity; across: (3, width), their weights. A work item takes the pixels k * run .. of its row. */
+__kernel void transfer_narrow(__global const SAMPLE *restrict photo, __global const float *restrict nodes,
+                              __global const float *restrict across,
+                              __global const float *restrict light_of, __global const int *restrict code_of,
+                              __global SAMPLE *restrict result, int height, int width, int rows, int top, int run) {
+  int y = get_global_id(1), begin = get_global_id(0) * run, end = width - begin < run ? width : begin + run;
+  long centre = (2 * (long)(top + y) + 1) * rows;
+  int i = (int)(centre / (2 * (long)height));
+  float down[3];
+  spline((float)(centre - (2 * (long)i + 1) * height) / (2.0f * height), down);
+  nodes += (size_t)i * 12 * width;
+  photo += (size_t)y * width * 3;
+  result += (size_t)y * width * 3;
+#pragma clang loop vectorize_width(LANES) interleave_count(1)
+  for (int x = begin; x < end; ++x) {
+    float g = LIGHTNESS((photo + 3 * x)), total = 0.0f, r = 0.0f, s = 0.0f, t = 0.0f;
+#pragma unroll
+    for (int k = 0; k < 9; ++k) {
+      __global const float *near = nodes + 4 * k * width + x;
+      float distance = g - near[3 * width];
+      float weight = down[k / 3] * across[k % 3 * width + x] * rough_reciprocal(1.0f + distance * distance);
+      total += weight;
+      r += weight * near[0];
+      s += weight * near[width];
+      t += weight * near[2 * width];
+    }
+    relight(photo + 3 * x, result + 3 * x, light_of, code_of, r, s, t, total);
   }
 }

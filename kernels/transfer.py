@@ -58,7 +58,8 @@ def _sharpen(x: np.ndarray) -> np.ndarray:
     return np.clip(2 * x - blurred, low, high)
 
 
-def _neighbours(x: np.ndarray, axis: int) -> list[np.ndarray]:
-    """Of every cell the one before, itself and the one after along an axis; the border is repeated."""
-    padded = np.pad(x, [(1, 1) if i == axis else (0, 0) for i in range(3)], mode="edge")
-    return [np.take(padded, range(k, k + x.shape[axis]), axis) for k in range(3)]
+def _neighbours(x: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of every cell the one before, itself, the one after along axis 0 or 1; the border is repeated."""
+    along = x.swapaxes(0, axis)
+    before, after = np.concatenate([along[:1], along[:-1]]), np.concatenate([along[1:], along[-1:]])
+    return before.swapaxes(0, axis), x, after.swapaxes(0, axis)

@@ -97,6 +97,14 @@ def test_accuracy_of_transfer(ops, size, dtype, most):
     assert error < most
 
 
+@pytest.mark.parametrize("columns", [1, 3, 6, 7, 13, 30, 120, 403, 500])
+def test_cells_of_any_width_are_relit_alike(ops, columns):
+    """Cells of 400 to less than one pixel: wide ones go by registers of their own, narrow ones share them."""
+    photo, (source, relit) = random_photo((41, 403), np.uint8), random_grids((5, columns))
+    expected = np.clip(transferred(photo, source, relit), 0, 1) * 255
+    assert np.abs(ops.transfer(photo, source, relit) - expected).max() < 0.51
+
+
 @pytest.mark.parametrize("grid", [(1, 1), (1, 9), (64, 64), (3, 300)])
 @pytest.mark.parametrize("size", SIZES)
 def test_any_grid_fits_any_photo(ops, size, grid):

@@ -127,9 +127,10 @@ MUTATIONS = {
     "the spline": ("transfer.cl", "0.75f - d * d", "0.74f - d * d"),
     "full lanes only": (
         "transfer.cl",
-        "for (int k = at; k < at + LANES; ++k) relight(from + 3 * k",
-        "for (int k = at; k < at + LANES; ++k) relight(from + 3 * at",
+        "for (int k = at; k < at + LANES; ++k) relight_amid(from + 3 * k",
+        "for (int k = at; k < at + LANES; ++k) relight_amid(from + 3 * at",
     ),
+    "a narrow cell's light": ("transfer.cl", "t += weight * near[2 * width]", "t += weight * near[width]"),
     "a soft edge": ("draw.cl", "3.0f - 2.0f * t", "3.0f - 1.9f * t"),
     "a cell of the lattice": ("sparsify.cl", "vstore3(mean,", "vstore3(1.001f * mean,"),
 }
