@@ -85,11 +85,11 @@ class Budget:
 
     config: Config = field(default_factory=lambda: Config(96, 3, 4, patch=4, fine=8, half=32, quarter=64))
     stage1: Plan = field(
-        default_factory=lambda: Plan(steps=700, batch=16, warmup=50, average=60, grids=GRIDS)
+        default_factory=lambda: Plan(steps=400, batch=8, warmup=30, average=30, grids=GRIDS)
     )
     lora: Plan = field(
         default_factory=lambda: Plan(
-            steps=150, batch=16, rate=2e-4, warmup=20, average=30, seed=1, grids=GRIDS
+            steps=80, batch=8, rate=2e-4, warmup=10, average=15, seed=1, grids=GRIDS
         )
     )
     rank: int = 16

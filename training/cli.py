@@ -253,9 +253,9 @@ def ablation(
     held_out: Annotated[Path, typer.Argument(help="Folder of `maps` of other renders, to judge by.")],
     renders: Annotated[Path, typer.Argument(help="What MAPS was made of; its other scenes become photos.")],
     out: Annotated[Path, typer.Option(help="Folder of the networks and the report; resumable.")],
-    steps: Annotated[int, typer.Option(min=1, help="Of stage 1.")] = 700,
-    lora_steps: Annotated[int, typer.Option(min=1)] = 150,
-    batch: Annotated[int, typer.Option(min=2, help="Even; in stage 2 half of it is real pairs.")] = 16,
+    steps: Annotated[int, typer.Option(min=1, help="Of stage 1.")] = 400,
+    lora_steps: Annotated[int, typer.Option(min=1)] = 80,
+    batch: Annotated[int, typer.Option(min=2, help="Even; in stage 2 half of it is real pairs.")] = 8,
     precision: Precision = "no",
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:
