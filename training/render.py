@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -199,11 +200,13 @@ def view(
 
 def lit(stage: Stage, described: Scene, camera: Camera) -> Scene:
     """The scene with the first SOURCES local sources that light enough of a view, and its environment if it
-    does. What lights next to nothing would, brought to the common mean, be noise."""
+    does; where none does, the one that lights most. What lights next to nothing would, brought to the common
+    mean, be noise."""
     *local, environment = described.sources
     found = islice((source for source in local if reach(stage, camera, source) >= LIT), SOURCES)
     around = [environment] if reach(stage, camera, environment) >= LIT else []
-    return replace(described, sources=(*found, *around))
+    kept = (*found, *around) or (max(described.sources, key=partial(reach, stage, camera)),)
+    return replace(described, sources=kept)
 
 
 def reach(stage: Stage, camera: Camera, source: Source) -> float:
