@@ -1,12 +1,18 @@
-"""How many floating-point operations a step of the network is, counted from the shapes of a real run."""
+"""A step of the network: how many floating-point operations it is, and how fast its products run alone.
+
+Both come from a real run: ONNX Runtime tells the shapes and the time of every node.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 import tempfile
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -17,58 +23,117 @@ from dior_rt.bundle import Bundle
 
 PRODUCTS = ("MatMul", "MatMulInteger", "MatMulNBits", "Gemm")
 CONVOLUTIONS = ("Conv", "ConvInteger")
+TRANSPOSED = ("ConvTranspose",)
+ATTENTIONS = ("Attention", "MultiHeadAttention")
+#: What ONNX Runtime's own optimisation makes of the first three.
+FUSED = ("FusedMatMul", "FusedGemm", "FusedConv", "DynamicQuantizeMatMul", "MatMulIntegerToFloat")
+TRIES = 9
 
 Shape = Sequence[int]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step's cost depends on: the network, as its bundle's folder, the cells of the grid in units of
+    the grid's multiple, and the branches of guidance."""
+
+    bundle: str
+    rows: int
+    columns: int
+    branches: int
+
+    @property
+    def name(self) -> str:
+        """For people and for JSON."""
+        return f"{self.bundle}, {self.rows} x {self.columns} x {self.branches}"
 
 
 def node_flops(operation: str, inputs: Sequence[Shape], output: Shape) -> int:
     """2 x (elements of the output) x (length of the sums): a multiplication and an addition each.
 
     Matrix products sum over the last side of their first input. A convolution sums over all sides of its
-    weights but the first. Everything else is not counted: it is bound by memory, and small beside these.
+    weights but the first; a transposed one makes of every element all sides of its weights but the first.
+    Attention is two products. Everything else is not counted: it is bound by memory, and small beside these.
     """
     if operation in PRODUCTS:
         return 2 * math.prod(output) * inputs[0][-1]
     if operation in CONVOLUTIONS:
         return 2 * math.prod(output) * math.prod(inputs[1][1:])
+    if operation in TRANSPOSED:
+        return 2 * math.prod(inputs[0]) * math.prod(inputs[1][1:])
+    if operation in ATTENTIONS:  # queries (batch, tokens, width) by keys (batch, others, width), by values
+        return 4 * math.prod(inputs[0]) * inputs[1][-2]
     return 0
 
 
-def graph_flops(model: Path, feeds: Mapping[str, NDArray]) -> int:
-    """The operations of one run of an ONNX graph, its nodes as they stand in the file, not fused."""
-    options = ort.SessionOptions()
-    options.log_severity_level = 3
-    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
-    options.enable_profiling = True
-    with tempfile.TemporaryDirectory(prefix="dior-bench-") as folder:
-        options.profile_file_prefix = str(Path(folder) / "profile")
-        session = ort.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
-        session.run(None, dict(feeds))
-        events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
-    runs = [event["args"] for event in events if event["name"].endswith("_kernel_time")]
-    return sum(
-        node_flops(run["op_name"], _shapes(run["input_type_shape"]), output)
-        for run in runs
-        for output in _shapes(run["output_type_shape"])[:1]
-    )
+def graph_flops(model: Path, feeds: Mapping[str, NDArray]) -> dict[str, int]:
+    """The operations of one run of an ONNX graph by kind of node, its nodes as they stand in the file, not
+    fused."""
+    found: dict[str, int] = defaultdict(int)
+    for node in _profile(model, feeds, ort.GraphOptimizationLevel.ORT_DISABLE_ALL, 1):
+        what = node["args"]
+        for output in _shapes(what["output_type_shape"])[:1]:
+            found[what["op_name"]] += node_flops(what["op_name"], _shapes(what["input_type_shape"]), output)
+    return found
 
 
-def step_flops(bundle: Bundle, size: tuple[int, int], guidance: float) -> int | None:
-    """The operations of one step for a photo of `size` pixels; guidance other than 0 and 1 doubles them.
+def product_rate(bundle: Bundle, step: Step) -> float:
+    """Floating-point operations a second of the network's matrix products and convolutions by themselves.
+
+    They are timed where they are, in runs of the whole graph on as many threads as ONNX Runtime takes: at
+    their own shapes, with all weights passing through the caches between one use and the next. The seconds
+    are the medians of a few runs, node by node. Attention is left out, for there is more in it than products.
+    """
+    model, feeds = bundle.path("velocity"), step_feeds(bundle, step)
+    flops = sum(count for kind, count in graph_flops(model, feeds).items() if kind not in ATTENTIONS)
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for node in _profile(model, feeds, ort.GraphOptimizationLevel.ORT_ENABLE_ALL, TRIES):
+        if node["args"]["op_name"] in (*PRODUCTS, *CONVOLUTIONS, *TRANSPOSED, *FUSED):
+            seconds[node["name"]].append(node["dur"] * 1e-6)
+    return flops / sum(map(median, seconds.values()))
+
+
+def step_of(bundle: Bundle, size: tuple[int, int], guidance: float) -> Step | None:
+    """The step for a photo of `size` pixels; guidance other than 0 and 1 takes two branches.
 
     None for families without a light grid, whose graphs are too large to be run for this alone.
     """
     grid = bundle.manifest.grid
     if grid is None:
         return None
-    branches = 1 if guidance in (0, 1) else 2
     rows, columns = (side // grid.multiple for side in grid.shape(*size))
-    sides = {"batch": branches, "rows": rows, "columns": columns}
-    feeds = {
+    return Step(str(bundle.folder), rows, columns, 1 if guidance in (0, 1) else 2)
+
+
+def step_flops(bundle: Bundle, step: Step) -> int:
+    """The operations of one step."""
+    return sum(graph_flops(bundle.path("velocity"), step_feeds(bundle, step)).values())
+
+
+def step_feeds(bundle: Bundle, step: Step) -> dict[str, NDArray]:
+    """Inputs of a step of that size; values change neither the count nor the time."""
+    sides = {"batch": step.branches, "rows": step.rows, "columns": step.columns}
+    return {
         tensor.name: np.ones([_side(side, sides) for side in tensor.shape], tensor.dtype)
-        for tensor in bundle.manifest.graphs["velocity"].inputs  # values do not change the count
+        for tensor in bundle.manifest.graphs["velocity"].inputs
     }
-    return graph_flops(bundle.path("velocity"), feeds)
+
+
+def _profile(
+    model: Path, feeds: Mapping[str, NDArray], level: ort.GraphOptimizationLevel, runs: int
+) -> list[dict[str, Any]]:
+    """What ONNX Runtime says of every node of every run."""
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    options.graph_optimization_level = level
+    options.enable_profiling = True
+    with tempfile.TemporaryDirectory(prefix="dior-bench-") as folder:
+        options.profile_file_prefix = str(Path(folder) / "profile")
+        session = ort.InferenceSession(str(model), options, providers=["CPUExecutionProvider"])
+        for _ in range(runs):
+            session.run(None, dict(feeds))
+        events = json.loads(Path(session.end_profiling()).read_text(encoding="utf-8"))
+    return [event for event in events if event["name"].endswith("_kernel_time")]
 
 
 def _side(side: int | str, known: Mapping[str, int]) -> int:

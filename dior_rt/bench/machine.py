@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,7 +13,9 @@ from time import perf_counter
 
 import numpy as np
 
+from dior_rt.bench.flops import Step, product_rate
 from dior_rt.bench.plan import usable_cores
+from dior_rt.bundle import Bundle
 
 GEMM_SIDE = 1024
 COPY_BYTES = 1 << 28
@@ -38,10 +40,11 @@ class Machine:
 class Rooflines:
     """gemm: floating-point operations a second of NumPy's float32 product of two 1024 x 1024 matrices, on as
     many threads as its BLAS takes. copy: bytes read and written a second in copying 256 MiB, by what copies
-    ("numpy" in main memory, "opencl:0" in that device's)."""
+    ("numpy" in main memory, "opencl:0" in that device's). products: as `product_rate`, by the step's name."""
 
     gemm: float
     copy: dict[str, float]
+    products: dict[str, float]
 
 
 def this_machine() -> Machine:
@@ -55,18 +58,21 @@ def this_machine() -> Machine:
     return Machine(platform.platform(), _cpu(), os.cpu_count() or 1, usable_cores(), _memory(), versions)
 
 
-def measure_rooflines(ops: Sequence[str]) -> Rooflines:
-    """One measurement, each figure the best of a few tries. ops: the kernels whose memory is measured."""
+def measure_rooflines(ops: Sequence[str], steps: Mapping[Step, Bundle]) -> Rooflines:
+    """One measurement, each figure the best or the median of a few tries. ops: the kernels whose memory is
+    measured; steps: those whose products are, and their bundles."""
     copies = {name: _opencl_copy(name) for name in ops if name != "numpy"}
-    return Rooflines(_gemm(), {"numpy": _numpy_copy(), **copies})
+    products = {step.name: product_rate(bundle, step) for step, bundle in steps.items()}
+    return Rooflines(_gemm(), {"numpy": _numpy_copy(), **copies}, products)
 
 
 def medians(measured: Sequence[Rooflines]) -> Rooflines:
     """The median of each figure."""
-    names = measured[0].copy
+    first = measured[0]
     return Rooflines(
         median(one.gemm for one in measured),
-        {name: median(one.copy[name] for one in measured) for name in names},
+        {name: median(one.copy[name] for one in measured) for name in first.copy},
+        {name: median(one.products[name] for one in measured) for name in first.products},
     )
 
 

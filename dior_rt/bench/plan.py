@@ -46,6 +46,10 @@ class Setting:
         ]
         return ", ".join(changed) or "reference"
 
+    def takes_whole_cpu(self) -> bool:
+        """Whether all cores work on the network, as they do on what its rate is compared with."""
+        return self.device == "cpu" and self.threads is None
+
     def how(self) -> dict[str, Any]:
         """The arguments of `Relighter.relight`."""
         names = ("preset", "steps", "solver", "guidance", "tolerance")

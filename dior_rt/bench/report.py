@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import Final, Literal
 
 from dior_rt.bench.difference import Difference
-from dior_rt.bench.flops import step_flops
+from dior_rt.bench.flops import step_flops, step_of
 from dior_rt.bench.machine import Machine, Rooflines
 from dior_rt.bench.plan import Setting
 from dior_rt.bench.run import Measured, Outcome
@@ -22,7 +22,7 @@ from dior_rt.files import check_readable, reason, replacing
 from dior_rt.pictures import Photo
 from dior_rt.records import parse, read_json, unparse
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 MOST_BYTES = 16 << 20
 
 
@@ -54,7 +54,8 @@ class Result:
 
     ratio: the reference's total seconds by this one's. seconds, steps, start_up, start_up_cold, peak_bytes:
     see `Measured`. step_flops: of one step, the mean over the photos. gemm_share: what a step reaches of the
-    machine's GEMM rate; only where the CPU's cores all take part. copy_share: what the kernels reach of the
+    machine's GEMM rate; product_share: of the rate at which its own matrix products and convolutions run;
+    both only where the CPU's cores all take part. copy_share: what the kernels reach of the
     copy bandwidth of the memory that they work in, see `copy_share`. None: not known.
     """
 
@@ -71,6 +72,7 @@ class Result:
     difference: Difference
     step_flops: float | None
     gemm_share: float | None
+    product_share: float | None
     copy_share: float
 
 
@@ -78,7 +80,7 @@ class Result:
 class Report:
     """One benchmark. results: the reference first. failed: setting -> why it could not be run."""
 
-    format: Literal[2] = FORMAT
+    format: Literal[3] = FORMAT
     machine: Machine
     bundles: tuple[BundleFacts, ...]
     photos: tuple[PhotoFacts, ...]
@@ -157,9 +159,16 @@ def _result(
     bundle = next(b for b in bundles if str(b.folder) == setting.bundle)
     # Elsewhere one step may ask the network twice, or run a branch less than another.
     alike = setting.solver == "euler" and not setting.interval
-    counts = [step_flops(bundle, photo.size, setting.guidance) if alike else None for photo in photos]
-    flops = fmean(count for count in counts if count) if all(counts) else None
-    whole_cpu = setting.device == "cpu" and setting.threads is None
+    each = [step_of(bundle, photo.size, setting.guidance) for photo in photos] if alike else []
+    counts = {step: step_flops(bundle, step) for step in set(each) if step}
+    flops = fmean(counts[step] for step in each if step) if counts else None
+    rates = outcome.rooflines
+    whole_cpu = setting.takes_whole_cpu()
+    alone = (
+        fmean(counts[step] / rates.products[step.name] for step in each if step)
+        if counts and whole_cpu
+        else None
+    )
     return Result(
         name=setting.name(reference),
         setting=setting,
@@ -173,11 +182,12 @@ def _result(
         peak_bytes=measured.peak_bytes,
         difference=measured.difference,
         step_flops=flops,
-        gemm_share=flops / per_step / outcome.rooflines.gemm if flops and whole_cpu else None,
+        gemm_share=flops / per_step / rates.gemm if flops and whole_cpu else None,
+        product_share=alone / per_step if alone else None,
         copy_share=copy_share(
             fmean(photo.pixels.nbytes for photo in photos),
             seconds["kernels"] + seconds["transfer"],
-            outcome.rooflines.copy[setting.ops],
+            rates.copy[setting.ops],
         ),
     )
 

@@ -14,9 +14,11 @@ from pathlib import Path
 from statistics import median
 
 from dior_rt.bench.difference import Difference, Distance, compare_pictures, worst
+from dior_rt.bench.flops import Step, step_of
 from dior_rt.bench.machine import Rooflines, measure_rooflines, medians
 from dior_rt.bench.plan import Setting, interleave
 from dior_rt.bench.worker import STAGES, Job, Pair, Sample
+from dior_rt.bundle import Bundle, read_bundle
 from dior_rt.errors import DeviceError, DiorError
 from dior_rt.files import reason
 from dior_rt.pictures import read_photo
@@ -74,7 +76,7 @@ def measure(
     lpips: measures what the eye sees, as well. strict: raise DeviceError where any setting fails, not only
     where the reference does. All are tried before the first is timed.
     """
-    reference = settings[0]
+    reference, steps = settings[0], _steps(settings, pairs)
     with tempfile.TemporaryDirectory(prefix="dior-bench-") as scratch:
         caches = {host: Path(scratch) / f"cache-{i}" for i, host in enumerate(map(_host, settings))}
         folders = {setting: Path(scratch) / f"pictures-{i}" for i, setting in enumerate(settings)}
@@ -106,9 +108,8 @@ def measure(
         for setting in interleave(settings, repeats):
             if setting == reference:
                 advance("rooflines")
-                rooflines.append(
-                    measure_rooflines(sorted({one.ops for one in settings if one not in failed}))
-                )
+                ops = sorted({one.ops for one in settings if one not in failed})
+                rooflines.append(measure_rooflines(ops, steps))
             advance(setting.name(reference))
             samples[setting] += attempt(setting, setting, pairs)
         running = [setting for setting in settings if setting not in failed]
@@ -141,6 +142,17 @@ def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Samp
         said = process.stderr.strip().splitlines() or ["it left no word"]
         where = f"{setting.device} and {setting.ops}"
         raise DeviceError(f"The run on {where} ended with code {process.returncode}: {said[-1]}.") from None
+
+
+def _steps(settings: Sequence[Setting], pairs: Sequence[Pair]) -> dict[Step, Bundle]:
+    """The steps whose products' rate is measured, as all cores of the CPU take part, and their bundles."""
+    sizes = {read_photo(Path(pair.photo)).size for pair in pairs}
+    found: dict[Step, Bundle] = {}
+    for folder, guidance in {(one.bundle, one.guidance) for one in settings if one.takes_whole_cpu()}:
+        bundle = read_bundle(Path(folder))
+        steps = [step_of(bundle, size, guidance) for size in sizes]
+        found |= {step: bundle for step in steps if step}
+    return found
 
 
 def _host(setting: Setting) -> Setting:

@@ -37,13 +37,14 @@ def as_markdown(report: Report) -> str:
             f"{result.start_up_cold:.2f}",
             f"{result.start_up:.2f}",
             _percent(result.gemm_share, 1),
+            _percent(result.product_share, 1),
             _percent(result.copy_share, 1),
         ]
         for result in report.results
     ]
     where = [
         "seconds", "read", "kernels", "steps", "a step", "transfer", "write", "start-up cold", "warm",
-        "of GEMM", "of copy",
+        "of GEMM", "of its products", "of copy",
     ]  # fmt: skip
     return "\n\n".join([table(heads, speed), table(where, stages), "\n".join(_facts(report))])
 
@@ -80,6 +81,10 @@ def _facts(report: Report) -> list[str]:
         f" medians of {report.repeats} interleaved",
         *(f"- bundle: {b.name}, {b.precision}, manifest {b.sha256[:12]}, {b.folder}" for b in report.bundles),
         f"- rooflines: GEMM {rooflines.gemm / 1e9:.1f} GFLOP/s; copy {copies}",
+        *(
+            f"- roofline: products of {name}: {rate / 1e9:.1f} GFLOP/s"
+            for name, rate in rooflines.products.items()
+        ),
         f"- machine: {machine.cpu}, {machine.usable_cores} of {machine.cores} cores, {memory},"
         f" {machine.system}",
         f"- versions: {', '.join(f'{name} {version}' for name, version in machine.versions.items())}",

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from dior_rt.bench.difference import Difference, compare_pictures, worst
-from dior_rt.bench.flops import node_flops, step_flops
+from dior_rt.bench.flops import node_flops, product_rate, step_feeds, step_flops, step_of
 from dior_rt.bench.machine import Rooflines, measure_rooflines, medians, this_machine
 from dior_rt.bench.plan import Setting, interleave, sweep, thread_counts
 from dior_rt.bench.report import copy_share, pareto_front, read_report, write_report
@@ -22,6 +24,7 @@ from dior_rt.bench.scene import write_scene
 from dior_rt.bench.tables import as_markdown, compare
 from dior_rt.bundle import Bundle, read_bundle
 from dior_rt.cli import run
+from dior_rt.engine import open_engine
 from dior_rt.errors import DeviceError, InputError
 from dior_rt.pictures import read_photo
 from dior_rt.presets import read_presets
@@ -186,6 +189,8 @@ def test_the_pareto_front_of_known_points() -> None:
 def test_operations_of_nodes() -> None:
     assert node_flops("MatMul", [(2, 64, 32), (32, 16)], (2, 64, 16)) == 2 * 2 * 64 * 16 * 32
     assert node_flops("Conv", [(1, 10, 8, 8), (6, 10, 3, 3), (6,)], (1, 6, 8, 8)) == 2 * 6 * 64 * 90
+    assert node_flops("ConvTranspose", [(1, 10, 8, 8), (10, 6, 2, 2)], (1, 6, 16, 16)) == 2 * 6 * 256 * 10
+    assert node_flops("Attention", [(2, 70, 32), (2, 50, 32)], (2, 70, 32)) == 2 * (2 * 70 * 50 * 32) * 2
     assert node_flops("Softmax", [(1, 64, 64)], (1, 64, 64)) == 0
 
 
@@ -202,24 +207,44 @@ def test_operations_of_a_network_counted_by_hand(mini_bundle: Path, guidance: fl
     blends = cells // 16 * quarter * (9 * quarter + 4 * half) + cells // 4 * half * (9 * half + 4 * fine)
     convolutions = cells * 9 * fine * (3 + fine + 9)  # the state, smooth, head
     wanted = 2 * branches * (once + network.depth * block + ends + blends + convolutions)
-    assert step_flops(read_bundle(mini_bundle), (100, 150), guidance) == wanted
+    bundle = read_bundle(mini_bundle)
+    step = step_of(bundle, (100, 150), guidance)
+    assert step is not None and (step.rows * patch, step.columns * patch) == (rows, columns)
+    assert step_flops(bundle, step) == wanted
 
 
 def test_a_family_without_a_light_grid_is_not_counted(mini_bundle: Path) -> None:
     bundle = read_bundle(mini_bundle)
-    assert step_flops(Bundle(bundle.folder, replace(bundle.manifest, grid=None)), (8, 8), 1.0) is None
+    assert step_of(Bundle(bundle.folder, replace(bundle.manifest, grid=None)), (8, 8), 1.0) is None
 
 
-def test_rooflines_are_what_this_machine_can_do() -> None:
+def test_the_products_of_a_step_are_a_part_of_its_time(mini_bundle: Path) -> None:
+    bundle = read_bundle(mini_bundle)
+    step = step_of(bundle, (300, 400), 1.0)
+    assert step is not None
+    engine, seconds = open_engine(bundle, "velocity", "cpu"), []
+    for _ in range(9):
+        start = time.perf_counter()
+        engine.run(step_feeds(bundle, step))
+        seconds.append(time.perf_counter() - start)
+    share = step_flops(bundle, step) / product_rate(bundle, step) / median(seconds)
+    assert 0.1 < share < 1.2  # other programs may slow one of the two
+
+
+def test_rooflines_are_what_this_machine_can_do(mini_bundle: Path) -> None:
     # From a slow core that others use as well, to a large server.
-    rooflines = measure_rooflines(["numpy"])
+    bundle = read_bundle(mini_bundle)
+    step = step_of(bundle, (100, 150), 1.0)
+    assert step is not None
+    rooflines = measure_rooflines(["numpy"], {step: bundle})
+    assert rooflines.products.keys() == {step.name} and 1e7 < rooflines.products[step.name] < 1e14
     assert 1e8 < rooflines.gemm < 1e14
     assert rooflines.copy.keys() == {"numpy"} and 1e7 < rooflines.copy["numpy"] < 1e13
 
 
 def test_rooflines_are_medians() -> None:
-    measured = [Rooflines(gemm, {"numpy": gemm / 2}) for gemm in (4.0, 100.0, 2.0)]
-    assert medians(measured) == Rooflines(4.0, {"numpy": 2.0})
+    measured = [Rooflines(gemm, {"numpy": gemm / 2}, {"a": gemm * 3}) for gemm in (4.0, 100.0, 2.0)]
+    assert medians(measured) == Rooflines(4.0, {"numpy": 2.0}, {"a": 12.0})
 
 
 def test_the_share_of_the_copy_bandwidth() -> None:
@@ -311,6 +336,8 @@ def test_a_quick_run_books_every_stage(quick) -> None:
         assert 0 < result.copy_share < 5
         # Counted where every step runs all branches, once.
         assert (result.gemm_share is None) == (result.setting.solver != "euler")
+        assert (result.gemm_share is None) == (result.product_share is None)
+        assert result.product_share is None or 0 < result.product_share < 2
         assert result.gemm_share is None or 0 < result.gemm_share < 5
 
 
