@@ -9,7 +9,7 @@ thinks of lamps, and of nothing that they do to one another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -17,19 +17,15 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.random import Generator
 from peft import PeftModel
-from PIL import Image
 from torch import Tensor, nn
 
 from dior_rt.errors import InputError
 from dior_rt.family import mini
-from dior_rt.files import make_folder, replacing
 from dior_rt.grid import GridRule
 from dior_rt.kernels import Strokes
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.training.backbone import MiniLora
-from dior_rt.training.camera import random_camera, white_balance
 from dior_rt.training.evaluation.baselines import quotient
 from dior_rt.training.evaluation.benchmarks import renders as benchmarks
 from dior_rt.training.evaluation.control import response
@@ -40,9 +36,8 @@ from dior_rt.training.evaluation.tasks import DRAWN, OPS, Task
 from dior_rt.training.fit import Plan, fit, fit_lora
 from dior_rt.training.maps import LUMI
 from dior_rt.training.network import LORA, WEIGHTS, Config, load_network
-from dior_rt.training.render import View
+from dior_rt.training.photos import take_photos
 from dior_rt.training.stage2 import Scene, fit_stage2, load_scenes
-from dior_rt.training.triplets import DIMMEST, exposed, mix, random_lights
 
 Told = Callable[[str, int, float], None]  # which training, step, running loss
 
@@ -50,7 +45,6 @@ PAIRS: Final = ("replace", "change")  # of every held-out view
 STILL: Final = ("keep",)  # what the brush visits: pictures under their own light
 GRID: Final = GridRule(cells=1024, multiple=4)
 GRIDS: Final = ((32, 32), (28, 40), (40, 28))
-PHOTOS: Final = 4  # of a scene that stands in for a real one
 EXAMPLES: Final = 3  # of a row, for the contact sheet
 
 LAMPS: Final = "strokes of the Lumi map"
@@ -84,13 +78,9 @@ class Budget:
     scenes: how many stand in for real ones."""
 
     config: Config = field(default_factory=lambda: Config(96, 3, 4, patch=4, fine=8, half=32, quarter=64))
-    stage1: Plan = field(
-        default_factory=lambda: Plan(steps=400, batch=8, warmup=30, average=30, grids=GRIDS)
-    )
+    stage1: Plan = field(default_factory=lambda: Plan(steps=400, batch=8, warmup=30, average=30, grids=GRIDS))
     lora: Plan = field(
-        default_factory=lambda: Plan(
-            steps=80, batch=8, rate=2e-4, warmup=10, average=15, seed=1, grids=GRIDS
-        )
+        default_factory=lambda: Plan(steps=80, batch=8, rate=2e-4, warmup=10, average=15, seed=1, grids=GRIDS)
     )
     rank: int = 16
     scenes: int = 60
@@ -134,37 +124,6 @@ def train(
     else:
         fit_lora(stage1 / WEIGHTS, views, lora, budget.rank, budget.lora, show)
     return Network.load(lora)
-
-
-def take_photos(renders: Path, out: Path, without: Path, scenes: int, seed: int = 0) -> Path:
-    """Photos of rendered scenes to `out/<scene>/<photo>.png`, of second cameras' views; returns `out`.
-
-    without: a folder of views whose scenes are left out. Raises InputError where there are too few others.
-    """
-    taken = {path.stem.partition("-")[0] for path in without.glob("*-*.npz")}
-    seconds = sorted(renders.glob("[0-9]*-1.npz"))
-    paths = [path for path in seconds if path.stem.partition("-")[0] not in taken]
-    if len(paths) < scenes:
-        raise InputError(
-            f"There are {len(paths)} scenes in {renders} besides those of {without}, not {scenes}."
-        )
-    for number, path in enumerate(paths[:scenes]):
-        view = View.load(path)
-        make_folder(folder := out / path.stem)
-        for k, photo in enumerate(photos_of(view, np.random.default_rng([seed, number]))):
-            with replacing(folder / f"{k}.png") as file:
-                Image.fromarray(photo).save(file, "PNG")
-    return out
-
-
-def photos_of(view: View, rng: Generator, count: int = PHOTOS) -> Iterator[Photo]:
-    """A view under random lights, as one camera of random style takes it each time: (H, W, 3) 8-bit sRGB."""
-    camera, balance = random_camera(rng), white_balance(rng)
-    usable = view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
-    for _ in range(count):
-        image, _ = mix(view, random_lights(rng, usable))
-        linear = image * exposed(image, rng.uniform(0.3, 1.1)) * balance
-        yield np.rint(camera.shot(linear, rng) * 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)

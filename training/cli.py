@@ -121,6 +121,20 @@ def qwen_lora(
 
 
 @app.command()
+def photos(
+    renders: Annotated[Path, typer.Argument(help="Folder of renders.")],
+    out: Annotated[Path, typer.Option(help="Folder for the photos: OUT/<view>/<k>.png.")],
+    scenes: Annotated[int | None, typer.Option(min=1, help="How many; all if not given.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Take photos of rendered scenes under several lights, by random cameras: pairs for `stage2`."""
+    from dior_rt.training.photos import take_photos
+
+    with typer.progressbar(length=scenes or len(list(renders.glob("*-1.npz"))), label="scenes") as bar:
+        take_photos(renders, out, None, scenes, seed, lambda done, total: bar.update(1))
+
+
+@app.command()
 def stage2(
     base: Annotated[
         Path,

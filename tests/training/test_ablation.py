@@ -21,11 +21,11 @@ from dior_rt.training.ablation import (
     Network,
     ablate,
     judge,
-    take_photos,
 )
 from dior_rt.training.fit import Plan
 from dior_rt.training.maps import KINDS, LUMI, render_maps
 from dior_rt.training.network import Config, Mini, load_network
+from dior_rt.training.photos import take_photos
 from dior_rt.training.render import View
 from dior_rt.training.stage2 import load_scenes
 
