@@ -51,7 +51,8 @@ LAMPS: Final = "strokes of the Lumi map"
 AHEAD: Final = "PSNR less the first row's"
 CONTROL: Final = "The light is cut from the true map of the target, of the row's kind or the Lumi map."
 BOUND: Final = "The quotient knows both true maps, of source and target."
-BRUSH: Final = "White dabs at 0.25 to 4 times the light that the row's own map says is there."
+BRUSH: Final = "White dabs at 0.25 to 4 times the light that a map says is there."
+DABS: Final = {"on its own map": None, "on the Lumi map": LUMI}  # of which kind
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class Budget:
     config: Config = field(default_factory=lambda: Config(96, 3, 4, patch=4, fine=8, half=32, quarter=64))
     stage1: Plan = field(default_factory=lambda: Plan(steps=400, batch=8, warmup=30, average=30, grids=GRIDS))
     lora: Plan = field(
-        default_factory=lambda: Plan(steps=80, batch=8, rate=2e-4, warmup=10, average=15, seed=1, grids=GRIDS)
+        default_factory=lambda: Plan(steps=80, batch=8, rate=1e-3, warmup=10, average=15, seed=1, grids=GRIDS)
     )
     rank: int = 16
     scenes: int = 60
