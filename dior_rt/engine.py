@@ -19,7 +19,7 @@ from dior_rt.providers import accelerators, open_session, translated
 
 Feeds = Mapping[str, NDArray]
 
-SELF_TEST_TOLERANCE = 1e-3  # of a row's largest value; float32 keeps 1e-5, TensorFloat-32 does not pass
+SELF_TEST_TOLERANCE = 3e-4  # of a row's largest value; float32 keeps 1e-5, TensorFloat-32 does not pass
 
 _DTYPES = {
     "tensor(float)": "float32",

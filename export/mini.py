@@ -33,6 +33,7 @@ from dior_rt.export.check import (
     random_feeds,
     relative_error,
 )
+from dior_rt.export.fused import OPSET, TRANSLATIONS, encode_fused, fused
 from dior_rt.export.lora import merge_lora
 from dior_rt.family import mini
 from dior_rt.files import reason
@@ -126,7 +127,7 @@ class Encode(torch.nn.Module):
         self.network = network
 
     def forward(self, photo: torch.Tensor, light: torch.Tensor, mask: torch.Tensor) -> Features:
-        return self.network.encode(photo, light, mask)
+        return encode_fused(self.network, photo, light, mask)
 
     def feeds(self, height: int, width: int, seed: int) -> Feeds:
         feeds = random_feeds(height, width, seed)
@@ -141,6 +142,7 @@ class Step(torch.nn.Module):
     def __init__(self, network: Mini) -> None:
         super().__init__()
         self.network = network
+        self.fused = fused(network)
 
     def forward(
         self,
@@ -152,8 +154,10 @@ class Step(torch.nn.Module):
         half: torch.Tensor,
         quarter: torch.Tensor,
         tokens: torch.Tensor,
+        cosine: torch.Tensor,
+        sine: torch.Tensor,
     ) -> torch.Tensor:
-        return self.network.step(x, sigma, mode, given, fine, half, quarter, tokens)
+        return self.fused.step(x, sigma, mode, given, fine, half, quarter, tokens, cosine, sine)
 
     def feeds(self, height: int, width: int, seed: int) -> Feeds:
         feeds = random_feeds(height, width, seed)
@@ -193,10 +197,12 @@ def convert(part: Encode | Step, path: Path, multiple: int) -> None:
     batch, rows, columns = Dim("batch", max=64), Dim("rows", max=256), Dim("columns", max=256)
     feeds = part.feeds(4 * multiple, 6 * multiple, seed=0)
 
-    def shape(array: Array) -> dict[int, Any]:
+    def shape(name: str, array: Array) -> dict[int, Any]:
         """Free sides; a feature of 2 x 2 cells has half as many rows as the grid."""
         if array.ndim < 4:
             return {0: batch}
+        if name in ("cosine", "sine"):
+            return {0: batch, 1: rows, 2: columns}
         cells = array.shape[2] // 4
         down, along = (cells * rows, cells * columns) if cells > 1 else (rows, columns)
         return {0: batch, 2: down, 3: along}
@@ -206,9 +212,11 @@ def convert(part: Encode | Step, path: Path, multiple: int) -> None:
             program = torch.onnx.export(
                 part,
                 kwargs={name: torch.from_numpy(array) for name, array in feeds.items()},
-                dynamic_shapes={name: shape(array) for name, array in feeds.items()},
+                dynamic_shapes={name: shape(name, array) for name, array in feeds.items()},
                 input_names=list(feeds),
                 output_names=list(part.outputs),
+                opset_version=OPSET,
+                custom_translation_table=TRANSLATIONS,
                 dynamo=True,
                 optimize=True,
                 verbose=False,

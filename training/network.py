@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +31,8 @@ from torch.nn import functional as F
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, reason, replacing
 
+Turns = tuple[Tensor, Tensor]  # cosine and sine of every token's place
+
 # The files of a checkpoint: what training writes and export reads.
 WEIGHTS = "model.safetensors"
 LORA = "lora"
@@ -39,7 +42,9 @@ RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
 BOUNCED = 0.05  # light where no source shines: it has bounced there, and drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
+LITTLE = 0.01  # of the cells around drawn: half of what is said there holds
 CLOSED = 2.0  # gates begin an eighth open
+LARGEST_LOGIT = 8.0
 DEVIATION = 0.5  # of x0 from what the network expects: some 0.12 in sRGB
 
 
@@ -76,7 +81,9 @@ def srgb_to_linear(encoded: Tensor) -> Tensor:
 def linear_to_srgb(linear: Tensor) -> Tensor:
     """IEC 61966-2-1, for values in 0..1; its straight foot goes on below 0."""
     return torch.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055
+        linear <= 0.0031308,
+        12.92 * linear,
+        1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055,
     )
 
 
@@ -95,17 +102,31 @@ def spread(drawn: Tensor, size: int) -> Tensor:
     drawn: (B, 4, h, w), values that are 0 where the mask, the last channel, is. Returns (B, 4, h, w), the
     means over what is drawn, and 0 for nothing drawn, towards 1 from a hundredth of the cells on.
     """
-    near = F.avg_pool2d(F.avg_pool2d(drawn, size), 3, 1, 1)  # (B, 4, h / size, w / size)
-    return _means(F.interpolate(near, scale_factor=float(size), mode="bilinear"))
+    return _of_what_is_drawn(around(drawn, size))
 
 
 def spread_everywhere(drawn: Tensor) -> Tensor:
     """As `spread`, over the whole picture."""
-    return _means(drawn.mean(dim=(2, 3), keepdim=True).expand_as(drawn))
+    return _of_what_is_drawn(everywhere(drawn).expand_as(drawn))
 
 
-def _means(sums: Tensor) -> Tensor:
-    return sums / (sums[:, 3:] + 0.01)
+def around(cells: Tensor, size: int) -> Tensor:
+    """The mean some three `size`s around every cell, smooth: (B, C, h, w) to the same."""
+    return _smooth(F.avg_pool2d(cells, size), size)
+
+
+def _smooth(means: Tensor, size: int) -> Tensor:
+    """Means of size x size cells, each blended with the eight around it, for every cell."""
+    return F.interpolate(F.avg_pool2d(means, 3, 1, 1), scale_factor=float(size), mode="bilinear")
+
+
+def everywhere(cells: Tensor) -> Tensor:
+    """The mean of the whole picture: (B, C, h, w) to (B, C, 1, 1)."""
+    return cells.mean(dim=(2, 3), keepdim=True)
+
+
+def _of_what_is_drawn(means: Tensor) -> Tensor:
+    return means / (means[:, 3:] + LITTLE)
 
 
 def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
@@ -119,13 +140,16 @@ def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
 
 class Features(NamedTuple):
     """What does not depend on the flow. given: photo, photo in linear light, its light if it were white
-    paper (encoded), the log of the drawn light, mask; the others are what convolutions see."""
+    paper (encoded), the log of 8 (drawn light + b), mask, and how the strokes reach a cell, see `_reach`;
+    cosine, sine: of the tokens' places, see `rotations`; the others are what convolutions see."""
 
-    given: Tensor  # (B, 13, h, w)
+    given: Tensor  # (B, 16, h, w)
     fine: Tensor  # (B, 16, h, w)
     half: Tensor  # (B, 64, h / 2, w / 2)
     quarter: Tensor  # (B, 128, h / 4, w / 4)
     tokens: Tensor  # (B, width, h / patch, w / patch)
+    cosine: Tensor  # (B, h / patch, w / patch, width / heads / 2)
+    sine: Tensor
 
 
 class Mini(nn.Module):
@@ -149,6 +173,7 @@ class Mini(nn.Module):
         self.modulation = nn.Linear(width, 6 * width)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.depth))
         self.unembed = nn.Linear(width, quarter * (patch // 4) ** 2)
+        self.divide_tokens = DivideTokens(patch // 4)
         self.blend_quarter = Blend(quarter, half)
         self.blend_half = Blend(half, fine)
         self.see_state = nn.Conv2d(3, fine, 3, padding=1)
@@ -177,16 +202,22 @@ class Mini(nn.Module):
     def encode(self, photo: Tensor, light: Tensor, mask: Tensor) -> Features:
         """What photo and strokes say, whatever the flow's state."""
         linear = srgb_to_linear(photo)
-        white, aim = encode_light(linear), torch.log(light + BOUNCED)
-        start = aim - torch.log(linear + BOUNCED)  # where the light would have to go on white paper
+        white, aim = encode_light(linear), torch.log(LUMI_SCALE * (light + BOUNCED))
+        start = aim - torch.log(
+            LUMI_SCALE * (linear + BOUNCED)
+        )  # where the light would have to go on white paper
         drawn = torch.cat([start * mask, mask], dim=1)  # (B, 4, h, w)
         said = [drawn, spread(drawn, self.config.patch), spread_everywhere(drawn)]
         seen = torch.cat([2 * photo - 1, encode_light(light) * mask, *said], dim=1)
         fine = F.silu(self.see(seen))
         half = F.silu(self.see_half(fine))
         quarter = F.silu(self.see_quarter(half))
-        given = torch.cat([photo, linear, white, aim, mask], dim=1)
-        return Features(given, fine, half, quarter, self.embed(quarter))
+        given = torch.cat([photo, linear, white, aim, mask, self._shares(mask)], dim=1)
+        tokens = self.embed(quarter)
+        batch, _, rows, columns = tokens.shape
+        turns = rotations(rows, columns, self.config.width // self.config.heads, photo.device)
+        cosine, sine = (turn.unflatten(0, (rows, columns)).expand(batch, -1, -1, -1) for turn in turns)
+        return Features(given, fine, half, quarter, tokens, cosine, sine)
 
     def step(
         self,
@@ -198,9 +229,11 @@ class Mini(nn.Module):
         half: Tensor,
         quarter: Tensor,
         tokens: Tensor,
+        cosine: Tensor,
+        sine: Tensor,
     ) -> Tensor:
         """The velocity at x and sigma, with what `encode` made of photo and strokes."""
-        relit, own = self._answers(x, sigma, mode, given, fine, half, quarter, tokens)
+        relit, own = self._answers(x, sigma, mode, given, fine, half, quarter, tokens, cosine, sine)
         return _towards(relit, own, x, sigma, mode)
 
     def _answers(
@@ -213,40 +246,81 @@ class Mini(nn.Module):
         half: Tensor,
         quarter: Tensor,
         tokens: Tensor,
+        cosine: Tensor,
+        sine: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """The relit picture less the photo, as x0 has it, and the photo's own light, encoded."""
         condition = F.silu(self.time(waves(sigma, self.config.width)) + self.mode(mode))  # (B, width)
-        cells = self._transform(tokens + self.embed_state(x), condition)  # (B, 128, h / 4, w / 4)
+        turns = cosine.flatten(1, 2), sine.flatten(1, 2)  # (B, rows * columns, width / heads / 2)
+        cells = self._transform(tokens + self.embed_state(x), condition, turns)  # (B, 128, h / 4, w / 4)
         cells = self.blend_quarter(cells + quarter)  # (B, 64, h / 2, w / 2)
         cells = self.blend_half(cells + half)  # (B, 16, h, w)
         # Near noise the state says nothing, near the image it says all: the gate follows sigma.
         state = self.see_state(x) * self.state_gate(condition)[:, :, None, None]
         cells = F.silu(self.smooth(cells + fine + state))
         raw, own, gates = self.head(cells).float().split(3, dim=1)  # (B, 3, h, w)
-        photo, linear, white, aim, mask = given.split((3, 3, 3, 3, 1), dim=1)
+        photo, linear, white, aim, mask, shares = given.split((3, 3, 3, 3, 1, 3), dim=1)
         own = white + own  # the photo's own light, encoded; of white paper it is the photo itself
         # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
-        drawn = mask * (aim - torch.log(decode_light(own.clamp(max=BRIGHTEST)) + BOUNCED))
-        return _relight(photo, linear, raw + drawn + (1 - mask) * self._reach(drawn, mask, gates)), own
+        brightness = torch.exp(own.clamp(0.0, BRIGHTEST) * math.log1p(LUMI_SCALE))  # 1 + 8 light
+        drawn = mask * (aim - torch.log(brightness - (1 - LUMI_SCALE * BOUNCED)))
+        return _relight(photo, linear, raw + drawn + self._reach(drawn, gates, shares)), own
 
-    def _reach(self, drawn: Tensor, mask: Tensor, gates: Tensor) -> Tensor:
+    def _reach(self, drawn: Tensor, gates: Tensor, shares: Tensor) -> Tensor:
         """How the light of the strokes goes on beside them: gates say how much of what is drawn nearby,
         farther off, and everywhere holds for a cell."""
-        drawn, patch = torch.cat([drawn, mask], dim=1), self.config.patch
-        near, far, everywhere = torch.sigmoid(gates - CLOSED).split(1, dim=1)
-        light = near * spread(drawn, patch // 2) + far * spread(drawn, patch)
-        return (light + everywhere * spread_everywhere(drawn))[:, :3]
+        near, far, wide = (torch.sigmoid(gates - CLOSED) * shares).split(1, dim=1)
+        nearby, farther, anywhere = self._means(drawn)
+        return near * nearby + far * farther + wide * anywhere
 
-    def _transform(self, tokens: Tensor, condition: Tensor) -> Tensor:
+    def _shares(self, mask: Tensor) -> Tensor:
+        """Make `_reach`'s three means those of what is drawn, and let them say nothing under the strokes."""
+        drawn = torch.cat([means.expand_as(mask) for means in self._means(mask)], dim=1)
+        return (1 - mask) / (drawn + LITTLE)
+
+    def _means(self, cells: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(B, C, h, w) on average around every cell, farther around, and everywhere (B, C, 1, 1)."""
+        size = self.config.patch // 2
+        small = F.avg_pool2d(cells, size)
+        large = F.avg_pool2d(small, 2)
+        return _smooth(small, size), _smooth(large, 2 * size), everywhere(large)
+
+    def _transform(self, tokens: Tensor, condition: Tensor, turns: Turns) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells."""
         rows, columns = tokens.shape[2:]
-        turns = rotations(rows, columns, self.config.width // self.config.heads, tokens.device)
         tokens = tokens.flatten(2).transpose(1, 2)  # (B, rows * columns, width)
-        modulation = self.modulation(condition).unflatten(1, (6, -1))  # (B, 6, width)
-        for block in self.blocks:
-            tokens = block(tokens, modulation, turns)
-        cells = self.unembed(_norm(tokens))
-        return F.pixel_shuffle(cells.transpose(1, 2).unflatten(2, (rows, columns)), self.config.patch // 4)
+        # All blocks' at once, (B, depth * 6, width): six vectors are little to work on.
+        about = torch.tensor([0.0, 1, 0, 0, 1, 0], device=tokens.device)[:, None]  # scales begin at 1
+        offsets = torch.stack([block.get_parameter("offset") for block in self.blocks]) + about
+        modulation = self.modulation(condition).unflatten(1, (1, 6, -1)) + offsets
+        vectors = modulation.flatten(1, 2).split(1, dim=1)
+        for index, block in enumerate(self.blocks):
+            tokens = block(tokens, vectors[6 * index : 6 * index + 6], turns)
+        tokens = _norm(tokens.unflatten(1, (rows, columns)))
+        return self.divide_tokens(tokens.movedim(3, 1), self.unembed)
+
+
+class DivideTokens(nn.Module):
+    """A linear map makes of every token the cells that it covers: (B, width, rows, columns) to
+    (B, C, factor * rows, factor * columns)."""
+
+    def __init__(self, factor: int) -> None:
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, tokens: Tensor, unembed: nn.Module) -> Tensor:
+        cells = unembed(tokens.movedim(1, 3)).movedim(3, 1)
+        return F.pixel_shuffle(cells, self.factor)
+
+
+class Divide(nn.Conv2d):
+    """Every cell becomes four: (B, C, h, w) to (B, finer, 2 h, 2 w)."""
+
+    def __init__(self, size: int, finer: int) -> None:
+        super().__init__(size, 4 * finer, 1)
+
+    def forward(self, cells: Tensor) -> Tensor:
+        return F.pixel_shuffle(super().forward(cells), 2)
 
 
 class Blend(nn.Module):
@@ -255,10 +329,10 @@ class Blend(nn.Module):
     def __init__(self, size: int, finer: int) -> None:
         super().__init__()
         self.blend = nn.Conv2d(size, size, 3, padding=1)
-        self.divide = nn.Conv2d(size, 4 * finer, 1)
+        self.divide = Divide(size, finer)
 
     def forward(self, cells: Tensor) -> Tensor:
-        return F.pixel_shuffle(self.divide(F.silu(self.blend(cells))), 2)
+        return self.divide(F.silu(self.blend(cells)))
 
 
 class Block(nn.Module):
@@ -272,20 +346,21 @@ class Block(nn.Module):
         self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
         self.up, self.down = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
-    def forward(self, tokens: Tensor, modulation: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
-        shift1, scale1, gate1, shift2, scale2, gate2 = (modulation + self.offset).unsqueeze(2).unbind(1)
-        tokens = tokens + gate1 * self._attend(_norm(tokens) * (1 + scale1) + shift1, turns)
-        hidden = F.gelu(self.up(_norm(tokens) * (1 + scale2) + shift2), approximate="tanh")
+    def forward(self, tokens: Tensor, modulation: Sequence[Tensor], turns: Turns) -> Tensor:
+        shift1, scale1, gate1, shift2, scale2, gate2 = modulation  # (B, 1, width) each
+        tokens = tokens + gate1 * self._attend(_norm(tokens) * scale1 + shift1, turns)
+        hidden = F.gelu(self.up(_norm(tokens) * scale2 + shift2), approximate="tanh")
         return tokens + gate2 * self.down(hidden)
 
-    def _attend(self, tokens: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
+    def _attend(self, tokens: Tensor, turns: Turns) -> Tensor:
         q, k, v = (
             self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
         )  # (B, H, N, d)
-        # Queries and keys of unit length keep the logits within 8 of 0, whatever the precision. Written out:
+        # Queries and keys of unit length keep the logits small, whatever the precision. Written out:
         # with so few tokens the fused attention's backward pass takes a multiple of the time on CPUs.
-        logits = rotate(_unit(q), turns) @ rotate(8 * _unit(k), turns).transpose(2, 3)  # (B, H, N, N)
-        mixed = logits.softmax(dim=-1) @ v
+        turns = turns[0].unsqueeze(1), turns[1].unsqueeze(1)  # for all heads
+        q, k = rotate(_unit(q), turns), rotate(LARGEST_LOGIT * _unit(k), turns)
+        mixed = (q @ k.transpose(2, 3)).softmax(dim=-1) @ v
         return self.proj(mixed.transpose(1, 2).flatten(2))
 
 
@@ -323,7 +398,7 @@ def rotations(rows: int, columns: int, size: int, device: torch.device) -> tuple
     return torch.cos(angle), torch.sin(angle)
 
 
-def rotate(part: Tensor, turns: tuple[Tensor, Tensor]) -> Tensor:
+def rotate(part: Tensor, turns: Turns) -> Tensor:
     """Turn the pairs (part[i], part[i + size / 2]) of (B, H, N, size) by their position's angles."""
     cosine, sine = turns
     a, b = part.chunk(2, dim=-1)

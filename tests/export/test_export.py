@@ -47,8 +47,8 @@ def graph(request, exported):
     return onnx.load(exported.path(request.param))
 
 
-def open_graphs(bundle) -> mini.Graphs:
-    return mini.Graphs(open_engine(bundle, "encode", "cpu"), open_engine(bundle, "velocity", "cpu"))
+def open_graphs(bundle, threads=None) -> mini.Graphs:
+    return mini.Graphs(*(open_engine(bundle, name, "cpu", threads) for name in ("encode", "velocity")))
 
 
 @pytest.fixture
@@ -73,6 +73,17 @@ def test_the_manifest_says_how_to_run_it_and_how_well_it_was_met(exported, recip
 def test_every_size_and_batch_agrees_with_torch(exported, rounded, size, batch):
     feeds = {name: array[:batch] for name, array in random_feeds(*size, seed=9).items()}
     assert relative_error(run(open_graphs(exported), feeds), evaluate(rounded, feeds)) < 1e-5
+
+
+@pytest.mark.parametrize("size", [(56, 80), (36, 100)])
+def test_threads_and_batches_change_no_bit(exported, size):
+    feeds = random_feeds(*size, seed=4)
+    one = {name: array[3:4] for name, array in feeds.items()}
+    want = run(open_graphs(exported, 1), one)
+    for threads in (1, 2, 3):
+        graphs = open_graphs(exported, threads)
+        np.testing.assert_array_equal(run(graphs, one), want)
+        np.testing.assert_array_equal(run(graphs, feeds)[3:4], want)
 
 
 def test_what_does_not_depend_on_the_flow_is_no_part_of_a_step(exported):
