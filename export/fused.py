@@ -37,7 +37,7 @@ TRANSLATIONS: Final[dict[Callable, Callable]] = {torch.ops.aten.log.default: _lo
 
 def fused(network: Mini) -> Mini:
     """A copy of the network whose `step` takes what `encode_fused` gives."""
-    other = copy.deepcopy(network)
+    other: Any = copy.deepcopy(network)  # some of its parts become parts of another kind
     config = network.config
     other.blocks = nn.ModuleList(FusedBlock(block) for block in other.blocks)
     weight = other.unembed.weight.T.reshape(config.width, config.quarter, *2 * (config.patch // 4,))
@@ -46,6 +46,7 @@ def fused(network: Mini) -> Mini:
         divide = blend.divide
         weight = divide.weight.reshape(-1, 2, 2, divide.in_channels).movedim(3, 0)
         blend.divide = Transposed(weight)
+    assert isinstance(other, Mini)
     return other
 
 
@@ -123,6 +124,7 @@ def _linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
     return linear
 
 
-def _tiled(bias: Tensor, factor: int, coarse: Tensor) -> Tensor:
+def _tiled(bias: Tensor | None, factor: int, coarse: Tensor) -> Tensor:
     """The biases (C * factor * factor,) of every cell that the cells of `coarse` become: (C, h, w)."""
+    assert bias is not None
     return bias.reshape(-1, factor, factor).repeat(1, *coarse.shape[2:])

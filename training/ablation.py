@@ -212,7 +212,7 @@ def check_same_pictures(own: Sequence[Task], others: Sequence[Task]) -> None:
 
 def controls(own: Sequence[Task], lamps: Sequence[Task]) -> dict[str, list[Strokes]]:
     """What drives a row, by name: its own map whole, strokes cut out of it, and out of the Lumi map."""
-    drawn = {name: [task.control(name) for task in own] for name in DRAWN}
+    drawn: dict[str, list[Strokes]] = {name: [task.control(name) for task in own] for name in DRAWN}
     return {**drawn, LAMPS: [task.control("strokes") for task in lamps]}
 
 

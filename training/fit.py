@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import torch
 from accelerate import Accelerator
@@ -154,7 +154,7 @@ def run(
         trained, lr=plan.rate, betas=(0.9, 0.99), weight_decay=plan.weight_decay, fused=True
     )
     network, optimizer = accelerator.prepare(network.train(), optimizer)
-    called = torch.compile(network, dynamic=False) if plan.compiled else network
+    called: Any = torch.compile(network, dynamic=False) if plan.compiled else network
     state = State(trained, optimizer, Average(trained, plan.average))
     if (out / STATE).exists():
         state.resume(out / STATE)

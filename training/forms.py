@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from typing import Any
+
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
@@ -73,6 +75,7 @@ def extruded(rng: Generator) -> Mesh:
     angle = np.linspace(0, 2 * np.pi, 97)[:-1]
     teeth, depth = rng.integers(3, 12), rng.uniform(0.1, 0.5)
     kind = rng.integers(4)
+    radius: NDArray[np.floating[Any]]
     if kind == 0:  # straight lines between far and near points
         radius = 1 - depth * np.abs((angle * teeth / np.pi + 1) % 2 - 1)
     elif kind == 1:
@@ -111,7 +114,7 @@ def standing(mesh: Mesh, rng: Generator) -> Mesh:
     """Upright, or laid flat."""
     if rng.uniform() < 0.6:
         return mesh
-    return Mesh(mesh.vertices[:, [0, 2, 1]] * np.float32([1, 1, -1]), mesh.uv, mesh.faces)
+    return Mesh(mesh.vertices[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32), mesh.uv, mesh.faces)
 
 
 def knot(rng: Generator) -> Mesh:

@@ -171,3 +171,10 @@ def test_without_the_figures_no_folder_is_made(tmp_path, monkeypatch) -> None:
     with pytest.raises(MissingExtraError, match=r"dior-rt\[synthbench\]"):
         render_synthbench(tmp_path / "bench", Recipe(1))
     assert not (tmp_path / "bench").exists()
+
+
+def test_a_target_without_lines_moves_nothing() -> None:
+    """So is that of the average figure."""
+    path = people._folder() / "targets" / "macrodetails" / "average.target.gz"
+    path.write_bytes(gzip.compress(b"# CC0\n"))
+    assert not people.target("average", 12).any()

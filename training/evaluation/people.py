@@ -89,8 +89,11 @@ def target(name: str, vertices: int) -> NDArray[np.float64]:
     path = _folder() / "targets" / "macrodetails" / f"{name}.target.gz"
     try:
         with gzip.open(path, "rt") as file:
-            rows = np.loadtxt(file, comments="#", ndmin=2)
+            lines = [line.split() for line in file if line.strip() and not line.startswith("#")]
         moves = np.zeros((vertices, 3))
+        if not lines:  # the average figure is the base mesh itself
+            return moves
+        rows = np.array(lines, np.float64)
         moves[rows[:, 0].astype(int)] = rows[:, 1:]
         return moves
     except (OSError, EOFError, ValueError, IndexError) as error:

@@ -115,7 +115,7 @@ def make(number: int, recipe: Recipe) -> Task:
 def shown(seen: View, seed: list[int]) -> tuple[Pair, Shown, Shown]:
     """The pair of a view that a seed draws, and its pictures as they are shown."""
     sample = pair(np.random.default_rng(seed), seen, "replace")
-    return sample, *(OPS.encode_srgb(linear, np.uint8) for linear in (sample.photo, sample.relit))
+    return sample, OPS.encode_srgb(sample.photo, np.uint8), OPS.encode_srgb(sample.relit, np.uint8)
 
 
 def differing(preview: View) -> list[int] | None:
@@ -132,7 +132,8 @@ def used(preview: View, seed: list[int]) -> NDArray[np.bool_]:
     """(sources,) which are lit in either picture of the pair that the seed draws."""
     rng = np.random.default_rng(seed)
     usable = preview.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
-    return (random_lights(rng, usable) + random_lights(rng, usable)).any(axis=1)
+    lights = random_lights(rng, usable) + random_lights(rng, usable)
+    return np.asarray(lights.any(axis=1))
 
 
 def in_full(
