@@ -182,9 +182,9 @@ def judge(networks: Mapping[Condition, Network], held_out: Path) -> tuple[Evalua
         if row.stage2:
             known = figures(score(quotients(own), own))
             bounds.append(Row("quotient", f"both of kind {row.kind}", known, None))
-        brush.append(
-            Row(row.name, "dabs", figures(follow(network, tasks(held_out, row.kind, STILL, 3))), None)
-        )
+        for control, kind in DABS.items():
+            still = tasks(held_out, kind or row.kind, STILL, seed=3)
+            brush.append(Row(row.name, control, figures(follow(network, still)), None))
     heading = f"{len(lamps) // len(PAIRS)} held-out views: all lights replaced; one light changed"
     tables = (
         Table(heading, len(lamps), CONTROL, tuple(rows), None),
