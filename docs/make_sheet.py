@@ -2,8 +2,8 @@
 
 python docs/make_sheet.py [PHOTO ...]
 
-Takes the photos that come with scikit-image, scikit-learn and matplotlib (`pip install scikit-learn`, too), and
-those named. Each row: the photo with all three strokes on it, and relit under each of them alone.
+Takes the photos that come with scikit-image, scikit-learn and matplotlib (`pip install scikit-learn`, too),
+and those named. Each row: the photo with all three strokes on it, and relit under each of them alone.
 """
 
 from __future__ import annotations
