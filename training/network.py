@@ -45,6 +45,7 @@ BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflo
 LITTLE = 0.01  # of the cells around drawn: half of what is said there holds
 CLOSED = 2.0  # gates begin an eighth open
 LARGEST_LOGIT = 8.0
+MURK = 0.1  # noise ten times as strong as the image hides half of the state
 DEVIATION = 0.5  # of x0 from what the network expects: some 0.12 in sRGB
 
 
@@ -250,13 +251,15 @@ class Mini(nn.Module):
         sine: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """The relit picture less the photo, as x0 has it, and the photo's own light, encoded."""
-        condition = F.silu(self.time(waves(sigma, self.config.width)) + self.mode(mode))  # (B, width)
+        clear = clarity(sigma)
+        heard = 1 - (1 - sigma) * clear  # where the state says nothing, neither does the time
+        condition = F.silu(self.time(waves(heard, self.config.width)) + self.mode(mode))  # (B, width)
         turns = cosine.flatten(1, 2), sine.flatten(1, 2)  # (B, rows * columns, width / heads / 2)
-        cells = self._transform(tokens + self.embed_state(x), condition, turns)  # (B, 128, h / 4, w / 4)
+        seen = x * clear[:, None, None, None]
+        cells = self._transform(tokens + self.embed_state(seen), condition, turns)  # (B, 128, h / 4, w / 4)
         cells = self.blend_quarter(cells + quarter)  # (B, 64, h / 2, w / 2)
         cells = self.blend_half(cells + half)  # (B, 16, h, w)
-        # Near noise the state says nothing, near the image it says all: the gate follows sigma.
-        state = self.see_state(x) * self.state_gate(condition)[:, :, None, None]
+        state = self.see_state(seen) * self.state_gate(condition)[:, :, None, None]
         cells = F.silu(self.smooth(cells + fine + state))
         raw, own, gates = self.head(cells).float().split(3, dim=1)  # (B, 3, h, w)
         photo, linear, white, aim, mask, shares = given.split((3, 3, 3, 3, 1, 3), dim=1)
@@ -370,6 +373,13 @@ def _norm(tokens: Tensor) -> Tensor:
 
 def _unit(part: Tensor) -> Tensor:
     return F.normalize(part, dim=-1)
+
+
+def clarity(sigma: Tensor) -> Tensor:
+    """(B,) in 0..1: how far a state is looked at. Next to noise it can say nothing of the answer; what the
+    network has answered so far, however faint in it, must not be taken for a word about the truth."""
+    image, noise = (1 - sigma) ** 2, (MURK * sigma) ** 2
+    return image / (image + noise)
 
 
 def waves(sigma: Tensor, width: int) -> Tensor:

@@ -26,7 +26,7 @@ from dior_rt.solvers import SOLVERS
 IDENTICAL: Final = 100.0  # dB that stand for a picture without any difference
 MARGIN: Final = 1.0  # dB that a preset keeps in hand for cases it has not seen
 
-STEPS: Final = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, 36, 40)
+STEPS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, 36, 40)
 SHIFTS: Final = (2.0, 3.0, 5.0, 8.0)
 NEVER: Final = (0.0, 0.0)
 INTERVALS: Final = (ALWAYS, (0.3, 1.0), (0.5, 1.0), (0.7, 1.0), (0.9, 1.0), (0.0, 0.9), (0.3, 0.9), NEVER)
@@ -114,7 +114,11 @@ def find(relighter: Relighter, cases: Sequence[Case], say: Callable[[str], None]
     left = iter(candidates(relighter.bundle))
     references: dict[int, NDArray] = {}
     hardest = list(range(len(cases)))  # those that refused a candidate come first
+    kept, cheapest = 0.0, own
     for name, promise in sorted(PROMISES.items(), key=lambda item: item[1]):
+        if kept >= promise + MARGIN:  # a weaker promise's preset keeps this one, too
+            found[name] = cheapest
+            continue
         found[name] = own
         for candidate in _cheaper(left, relighter.bundle, own):
             worst = IDENTICAL
@@ -131,7 +135,7 @@ def find(relighter: Relighter, cases: Sequence[Case], say: Callable[[str], None]
                     break
             else:
                 say(f"{name}: {candidate} keeps {worst:.1f} dB")
-                found[name] = candidate
+                found[name], cheapest, kept = candidate, candidate, worst
                 break
     return found
 

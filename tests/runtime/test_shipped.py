@@ -53,7 +53,6 @@ def test_dark_strokes_darken_and_bright_ones_are_far_brighter(relighter, photo, 
     assert dark < 0.8 * before and bright > 1.5 * dark
 
 
-@pytest.mark.xfail(reason="the model holds a lone, very strong stroke back; the README says so")
 def test_bright_strokes_brighten(relighter, photo, brushed):
     before = OPS.decode_srgb(photo)[brushed].mean()
     assert under_the_brush(relighter, photo, brushed, [3.0] * 3).mean() > before
