@@ -52,7 +52,7 @@ def test_the_cost_is_the_number_of_branches_run(small: Relighter) -> None:
     bundle = small.bundle  # shift 8, guidance 2
     # Four sigmas: 1, 0.96, 0.889, 0.727.
     assert cost(Preset(4), bundle) == 8
-    assert cost(Preset(4, interval=(0.9, 1.0)), bundle) == 6
+    assert cost(Preset(4, shift=8.0, interval=(0.9, 1.0)), bundle) == 6
     assert cost(Preset(4, interval=(0.0, 0.0)), bundle) == 4
     assert cost(Preset(4, "heun"), bundle) == 14
     assert cost(Preset(4, shift=1.0, interval=(0.4, 0.8)), bundle) == 6  # 1, 0.75, 0.5, 0.25
