@@ -125,7 +125,9 @@ class Pictures:
         painted = torch.where(mode == MODES["relight"], relit, lumi)
         light = draw(batch["light"]) * (batch["mask"] > 0)
         latents = {"x0": painted, "photo": photo, "light": light}
-        return {**batch, **{name: self.encode(picture) for name, picture in latents.items()}}
+        # Of the photo's own light this network has no idea that could be compared.
+        kept = {name: value for name, value in batch.items() if name != "own"}
+        return {**kept, **{name: self.encode(picture) for name, picture in latents.items()}}
 
     def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
         """Latents of drawn light -> the light on a grid, (B, 3, h, w), linear."""

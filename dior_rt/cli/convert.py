@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -13,7 +13,9 @@ from dior_rt.cli.extras import needs_extra
 from dior_rt.cli.text import table
 from dior_rt.errors import InputError
 from dior_rt.files import reason
-from dior_rt.schedule import ShiftSchedule
+
+if TYPE_CHECKING:
+    from dior_rt.schedule import ShiftSchedule
 
 Precision = Literal["fp32", "fp16", "int8", "int4"]
 
@@ -130,6 +132,8 @@ def export(
 
 
 def _schedule(shift: float) -> ShiftSchedule:
+    from dior_rt.schedule import ShiftSchedule  # numpy is not for --help
+
     try:
         return ShiftSchedule(shift)
     except ValueError as error:
