@@ -82,4 +82,7 @@ def main(named: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except OSError as error:
+        sys.exit(f"The sheet cannot be made: {error}.")

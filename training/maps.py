@@ -30,16 +30,18 @@ from dior_rt.training.render import (
     VIEWS,
     Stage,
     View,
-    _bsdf,
-    _half,
-    _load,
-    _render,
+    bsdf_of,
+    half_floats,
+    load_shapes,
     lumi_map,
     mitsuba,
     picture,
+    rays_for,
+    render,
+    unit_of,
 )
 from dior_rt.training.scenes import Camera, Material, Source, Thing, scene
-from dior_rt.training.triplets import DIMMEST
+from dior_rt.training.triplets import usable_sources
 
 Raster = NDArray[np.float32]
 
@@ -64,11 +66,13 @@ class Stages:
             return glossy_white(specular, exponent)
 
         def matte(material: Material) -> dict[str, Any]:
-            return _bsdf(replace(material, finish="matte", roughness=1.0))
+            return bsdf_of(replace(material, finish="matte", roughness=1.0))
 
         own = Stage.load(things)
         return Stages(
-            own, replace(own, original=_load(things, matte)), replace(own, white=_load(things, white))
+            own,
+            replace(own, original=load_shapes(things, matte)),
+            replace(own, white=load_shapes(things, white)),
         )
 
 
@@ -117,7 +121,7 @@ class Shot:
         """(H, W, 3) the reflectance that the camera sees, whatever the source; 0 where it sees nothing."""
         wanted = {"type": "aov", "aovs": "albedo:albedo"}
         shapes, size = stages.matte.original, self.resolution
-        return _render(shapes, self.camera, self.source, wanted, size, self.samples, self.seed)[..., :3]
+        return render(shapes, self.camera, self.source, wanted, size, self.samples, self.seed)[..., :3]
 
 
 def over(image: Raster, albedo: Raster) -> Raster:
@@ -134,13 +138,14 @@ def with_maps(view: View, camera: int = 0, samples: int = SAMPLES) -> dict[str, 
     described = scene(view.seed, VIEWS)
     stages = Stages.load(described.things)
     maps: dict[str, list[NDArray[np.float16]]] = {kind: [] for kind in KINDS}
+    usable = usable_sources(view)
     albedo = None
     for k, source in enumerate(described.sources):
-        rays = 2 * samples if source.kind == "dome" else samples
+        rays = rays_for(source, samples)
         shot = Shot(described.cameras[camera], source, view.lumi.shape[1], rays, seed=k)
         light = shot.lumi(stages)
-        unit = 0.25 / max(float(light.mean()), 1e-6)
-        if not np.array_equal(_half(light * unit), view.lumi[k]):
+        unit = unit_of(light)
+        if not np.array_equal(half_floats(light * unit), view.lumi[k]):
             raise InputError(f"The render of scene {view.seed} was made by other code; render it anew.")
         # The noise of the maps must tell nothing of that in the pictures.
         shot = replace(shot, seed=len(described.sources) + k)
@@ -151,9 +156,9 @@ def with_maps(view: View, camera: int = 0, samples: int = SAMPLES) -> dict[str, 
             shot.phong(stages),
         )
         # A source whose straight light misses what the camera sees is in no pair, whatever the map.
-        seen = unit if view.lumi[k].mean(dtype=np.float32) > DIMMEST else 0.0
+        seen = unit if usable[k] else 0.0
         for kind, raster in zip(KINDS, (light, *others), strict=True):
-            maps[kind].append(_half(raster * (unit if kind == LUMI else seen)))
+            maps[kind].append(half_floats(raster * (unit if kind == LUMI else seen)))
     return {kind: replace(view, lumi=np.stack(rasters)) for kind, rasters in maps.items()}
 
 

@@ -196,7 +196,7 @@ class Mini(nn.Module):
         with_own: bool = False,
     ) -> Tensor | tuple[Tensor, Tensor]:
         """The velocity; and, where asked for, what the network takes for the photo's own light, encoded."""
-        relit, own = self._answers(x, sigma, mode, *self.encode(photo, light, mask))
+        relit, own = self._answers(x, sigma, mode, self.encode(photo, light, mask))
         towards = _towards(relit, own, x, sigma, mode)
         return (towards, own) if with_own else towards
 
@@ -204,9 +204,8 @@ class Mini(nn.Module):
         """What photo and strokes say, whatever the flow's state."""
         linear = srgb_to_linear(photo)
         white, aim = encode_light(linear), torch.log(LUMI_SCALE * (light + BOUNCED))
-        start = aim - torch.log(
-            LUMI_SCALE * (linear + BOUNCED)
-        )  # where the light would have to go on white paper
+        # Where the light would have to go on white paper.
+        start = aim - torch.log(LUMI_SCALE * (linear + BOUNCED))
         drawn = torch.cat([start * mask, mask], dim=1)  # (B, 4, h, w)
         said = [drawn, spread(drawn, self.config.patch), spread_everywhere(drawn)]
         seen = torch.cat([2 * photo - 1, encode_light(light) * mask, *said], dim=1)
@@ -234,23 +233,13 @@ class Mini(nn.Module):
         sine: Tensor,
     ) -> Tensor:
         """The velocity at x and sigma, with what `encode` made of photo and strokes."""
-        relit, own = self._answers(x, sigma, mode, given, fine, half, quarter, tokens, cosine, sine)
+        features = Features(given, fine, half, quarter, tokens, cosine, sine)
+        relit, own = self._answers(x, sigma, mode, features)
         return _towards(relit, own, x, sigma, mode)
 
-    def _answers(
-        self,
-        x: Tensor,
-        sigma: Tensor,
-        mode: Tensor,
-        given: Tensor,
-        fine: Tensor,
-        half: Tensor,
-        quarter: Tensor,
-        tokens: Tensor,
-        cosine: Tensor,
-        sine: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    def _answers(self, x: Tensor, sigma: Tensor, mode: Tensor, features: Features) -> tuple[Tensor, Tensor]:
         """The relit picture less the photo, as x0 has it, and the photo's own light, encoded."""
+        given, fine, half, quarter, tokens, cosine, sine = features
         clear = clarity(sigma)
         heard = 1 - (1 - sigma) * clear  # where the state says nothing, neither does the time
         condition = F.silu(self.time(waves(heard, self.config.width)) + self.mode(mode))  # (B, width)

@@ -16,9 +16,9 @@ from PIL import Image
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, replacing
-from dior_rt.training.camera import random_camera, white_balance
+from dior_rt.training.camera import eight_bits, random_camera, white_balance
 from dior_rt.training.render import View
-from dior_rt.training.triplets import DIMMEST, exposed, mix, random_lights
+from dior_rt.training.triplets import exposed, mix, random_lights, usable_sources
 
 PHOTOS: Final = 4  # of a view
 
@@ -38,9 +38,11 @@ def take_photos(
     """
     taken = {path.stem.partition("-")[0] for path in without.glob("*-*.npz")} if without else set()
     paths = [path for path in sorted(renders.glob("*-1.npz")) if path.stem.partition("-")[0] not in taken]
-    if not paths or len(paths) < (scenes or 1):
-        besides = f" besides those of {without}" if without else ""
-        raise InputError(f"There are {len(paths)} scenes in {renders}{besides}, not {scenes or 'any'}.")
+    besides = f" besides those of {without}" if without else ""
+    if not paths:
+        raise InputError(f"There are no scenes in {renders}{besides}.")
+    if scenes and len(paths) < scenes:
+        raise InputError(f"There are {len(paths)} scenes in {renders}{besides}, not {scenes}.")
     paths = paths[:scenes]
     for number, path in enumerate(paths):
         view = View.load(path)
@@ -56,8 +58,8 @@ def take_photos(
 def photos_of(view: View, rng: Generator, count: int = PHOTOS) -> Iterator[NDArray[np.uint8]]:
     """A view under random lights, as one camera of random style takes it each time: (H, W, 3) 8-bit sRGB."""
     camera, balance = random_camera(rng), white_balance(rng)
-    usable = view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
+    usable = usable_sources(view)
     for _ in range(count):
         image, _ = mix(view, random_lights(rng, usable))
         linear = image * exposed(image, rng.uniform(0.3, 1.1)) * balance
-        yield np.rint(camera.shot(linear, rng) * 255).astype(np.uint8)
+        yield eight_bits(camera.shot(linear, rng))

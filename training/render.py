@@ -154,7 +154,7 @@ class Shapes:
     def under(self, source: Source | None) -> Any:
         """The renderer's scene under that source, or in the dark."""
         if id(source) not in self.scenes:
-            lights = {"source": _emitter(source)} if source else {}
+            lights = {"source": emitter_of(source)} if source else {}
             loaded = mitsuba().load_dict({"type": "scene", **lights, **self.things})
             self.scenes[id(source)] = source, loaded  # with the source, so that its id stays its own
         return self.scenes[id(source)][1]
@@ -169,7 +169,7 @@ class Stage:
 
     @staticmethod
     def load(things: tuple[Thing, ...]) -> Stage:
-        return Stage(_load(things, _bsdf), _load(things, _white))
+        return Stage(load_shapes(things, bsdf_of), load_shapes(things, _white))
 
 
 def view(
@@ -185,15 +185,14 @@ def view(
     guides = surfaces(stage, camera, resolution) if denoised else None
     images, lumi = [], []
     for k, source in enumerate(described.sources):
-        rays = 2 * samples if source.kind in AROUND else samples  # most of their rays are blocked
+        rays = rays_for(source, samples)
         light = lumi_map(stage, camera, source, resolution, rays, seed=k)
         image = picture(stage, camera, source, resolution, rays, seed=k)
         if guides:
             light, image = guides.lumi_map(light), guides.picture(image)
-        # A source's strength is arbitrary until triplets mix it; a common mean suits half floats.
-        unit = 0.25 / max(float(light.mean()), 1e-6)
-        images.append(_half(image * unit))
-        lumi.append(_half(light * unit))
+        unit = unit_of(light)
+        images.append(half_floats(image * unit))
+        lumi.append(half_floats(light * unit))
     kinds = tuple(source.kind for source in described.sources)
     return View(np.stack(images), np.stack(lumi), kinds, described.kind, seed)
 
@@ -218,11 +217,23 @@ def reach(stage: Stage, camera: Camera, source: Source) -> float:
 def surfaces(stage: Stage, camera: Camera, resolution: int) -> Guides:
     """What the camera sees of the things' own surfaces, for the denoiser."""
     integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
-    layers = _render(stage.original, camera, None, integrator, resolution, GUIDE_SAMPLES, seed=0)
+    layers = render(stage.original, camera, None, integrator, resolution, GUIDE_SAMPLES, seed=0)
     return Guides(*(np.ascontiguousarray(np.nan_to_num(part)) for part in np.split(layers, 2, axis=2)))
 
 
-def _half(raster: NDArray[np.float32]) -> NDArray[np.float16]:
+def rays_for(source: Source, samples: int) -> int:
+    """How many a pixel a source takes: of what shines from everywhere most rays are blocked."""
+    return 2 * samples if source.kind in AROUND else samples
+
+
+def unit_of(light: NDArray[np.float32]) -> float:
+    """What brings a Lumi map to the common mean, which suits half floats: a source's strength is arbitrary
+    until triplets mix it."""
+    return 0.25 / max(float(light.mean()), 1e-6)
+
+
+def half_floats(raster: NDArray[np.float32]) -> NDArray[np.float16]:
+    """Half floats, within their range; NaN becomes 0."""
     return np.clip(np.nan_to_num(raster), 0, 6e4).astype(np.float16)
 
 
@@ -231,7 +242,7 @@ def picture(
 ) -> NDArray[np.float32]:
     """(H, W, 3) linear radiance with the scene's own materials and bounced light."""
     integrator = {"type": "path", "max_depth": BOUNCES, "hide_emitters": True}
-    return _render(stage.original, camera, source, integrator, resolution, samples, seed)[..., :3]
+    return render(stage.original, camera, source, integrator, resolution, samples, seed)[..., :3]
 
 
 def lumi_map(
@@ -239,10 +250,10 @@ def lumi_map(
 ) -> NDArray[np.float32]:
     """(H, W, 3) the Lumi map of one source of radiance 1: white matte surfaces, direct light only."""
     integrator = {"type": "direct", "hide_emitters": True}
-    return _render(stage.white, camera, source, integrator, resolution, samples, seed)[..., :3]
+    return render(stage.white, camera, source, integrator, resolution, samples, seed)[..., :3]
 
 
-def _render(
+def render(
     shapes: Shapes,
     camera: Camera,
     source: Source | None,
@@ -251,13 +262,15 @@ def _render(
     samples: int,
     seed: int,
 ) -> NDArray[np.float32]:
+    """(H, W, channels of the integrator) of the shapes under a source, or in the dark."""
     mi = mitsuba()
     sensor, integrate = mi.load_dict(_sensor(camera, resolution)), mi.load_dict(integrator)
     rendered = mi.render(shapes.under(source), sensor=sensor, integrator=integrate, spp=samples, seed=seed)
     return np.array(rendered, dtype=np.float32)
 
 
-def _load(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> Shapes:
+def load_shapes(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> Shapes:
+    """The renderer's meshes of some things, each with the material that `bsdf` makes of its own."""
     mi = mitsuba()
     return Shapes(
         {f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)}
@@ -296,7 +309,8 @@ def _bumped(material: Material, surface: dict[str, Any]) -> dict[str, Any]:
     return {"type": "bumpmap", "heights": heights, "bsdf": surface}
 
 
-def _bsdf(material: Material) -> dict[str, Any]:
+def bsdf_of(material: Material) -> dict[str, Any]:
+    """A material as the renderer describes it."""
     mi = mitsuba()
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(material.reflectance), "raw": True}
     surface: dict[str, Any]
@@ -328,7 +342,8 @@ def _sensor(camera: Camera, resolution: int) -> dict[str, Any]:
     }
 
 
-def _emitter(source: Source) -> dict[str, Any]:
+def emitter_of(source: Source) -> dict[str, Any]:
+    """A source as the renderer describes it."""
     mi = mitsuba()
     radiance = {"type": "rgb", "value": 1.0}
     area = {"type": "area", "radiance": radiance}

@@ -198,6 +198,11 @@ def _furniture(rng: Generator, half: float, back: float) -> list[Thing]:
     return things
 
 
+def direction(around: float, up: float) -> Vector:
+    """The unit vector at two angles: around the vertical, from +z towards +x, and up from the ground."""
+    return np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
+
+
 def _camera(rng: Generator, kind: str) -> Camera:
     if kind == "interior":
         at = np.array([rng.uniform(-0.8, 0.8), rng.uniform(0.9, 1.9), rng.uniform(3.0, 4.5)])
@@ -205,9 +210,8 @@ def _camera(rng: Generator, kind: str) -> Camera:
             at, np.array([rng.uniform(-0.6, 0.6), rng.uniform(0.5, 1.2), -1.0]), rng.uniform(40, 62)
         )
     around, up, away = rng.uniform(-0.7, 0.7), rng.uniform(0.1, 0.8), rng.uniform(3.2, 5.0)
-    direction = np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
     target = np.array([rng.normal(0, 0.2), rng.uniform(0.3, 0.9), rng.normal(0, 0.2)])
-    return Camera(target + away * direction, target, rng.uniform(28, 48))
+    return Camera(target + away * direction(around, up), target, rng.uniform(28, 48))
 
 
 def _sources(rng: Generator, kind: str, cameras: tuple[Camera, ...]) -> list[Source]:
@@ -236,8 +240,7 @@ def _source(rng: Generator, kind: str) -> Source:
         at = np.array([rng.uniform(-1.5, 1.5), rng.uniform(0.3, 2.1), rng.uniform(-1, 4.5)])
     else:
         around, up, away = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 1.4), rng.uniform(1.2, 5)
-        direction = np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
-        at = target + away * direction
+        at = target + away * direction(around, up)
         at[1] = max(at[1], 0.5)
         at[2] = max(at[2], -2.2)  # in front of the backdrop
     return Source(form, at, target, float(size))  # type: ignore[arg-type]

@@ -36,7 +36,8 @@ Raster = NDArray[np.float32]
 Grids = tuple[tuple[int, int], ...]  # (rows, columns) in cells
 
 GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
-KINDS = ("change", "local", "replace", "keep")
+CHANGES = ("change", "local")  # of one light
+KINDS = (*CHANGES, "replace", "keep")
 KIND_SHARES = (0.2, 0.38, 0.32, 0.1)
 DABS = {"change": 0.15, "local": 0.4, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
@@ -73,6 +74,11 @@ def tint(rng: Generator) -> Raster:
     hue, saturation = rng.uniform(), rng.uniform(0.2, 1.0)
     shade = 1 - saturation * (1 - rainbow(hue))
     return (shade / max(shade.mean(), 0.4)).astype(np.float32)
+
+
+def usable_sources(view: View) -> NDArray[np.bool_]:
+    """(sources,) which of them light enough of what the camera sees."""
+    return np.asarray(view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST)
 
 
 def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
@@ -130,11 +136,11 @@ def pair(
 
     burnt: the relit picture may be far too bright for the display. balance: (3,) tints all lights alike.
     """
-    usable = view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
+    usable = usable_sources(view)
     kind = kind or str(rng.choice(KINDS, p=KIND_SHARES))
     lights = random_lights(rng, usable)
     relights = lights
-    if kind in ("change", "local"):
+    if kind in CHANGES:
         relights = change_one(rng, lights, usable)
     elif kind == "replace":
         relights = random_lights(rng, usable)
@@ -147,7 +153,7 @@ def pair(
     # A picture lost in white teaches little. One changed light must stay itself beside the others, so the
     # exposure gives way to it; lights that replace all others may be as strong as suits. But a person may
     # draw light that burns a place out, and has to see it burn.
-    if kind in ("change", "local") and not burnt:
+    if kind in CHANGES and not burnt:
         exposure = min(exposure, exposed(relit, rng.uniform(0.9, 1.5)))
     elif kind == "replace":
         strength = exposed(relit, 2 ** rng.uniform(0, 2) if burnt else rng.uniform(0.3, 1.1)) / exposure
@@ -194,7 +200,7 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     if rng.uniform() < DABS[sample.kind]:
         mask = dab(rng, interest(sample))
         return flat(sample.target, mask), mask
-    if sample.kind in ("change", "local") and rng.uniform() < 0.85:
+    if sample.kind in CHANGES and rng.uniform() < 0.85:
         drawn = ops.sparsify(sample.target, "strokes", seed, interest=interest(sample))
         if rng.uniform() < 0.5:
             return flat(sample.target, drawn.mask), drawn.mask

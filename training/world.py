@@ -15,7 +15,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from dior_rt.training import forms, shapes
-from dior_rt.training.scenes import Camera, Material, Scene, Source, Thing, Vector, unseen
+from dior_rt.training.scenes import Camera, Material, Scene, Source, Thing, Vector, direction, unseen
 from dior_rt.training.shapes import Mesh
 from dior_rt.training.sky import panorama
 from dior_rt.training.textures import fine_texture, relief, texture
@@ -241,9 +241,8 @@ def _camera(rng: Generator, kind: str) -> Camera:
         )
     around, up = rng.uniform(-0.6, 0.6), rng.uniform(0.12, 0.75)
     away = rng.uniform(2.4, 4.2) if kind == "still" else rng.uniform(3.6, 5.5)
-    direction = np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
     target = np.array([rng.normal(0, 0.2), rng.uniform(0.2, 0.7), rng.normal(0, 0.2)])
-    return Camera(target + away * direction, target, rng.uniform(28, 46))
+    return Camera(target + away * direction(around, up), target, rng.uniform(28, 46))
 
 
 def _source(rng: Generator, kind: str) -> Source:
@@ -259,7 +258,6 @@ def _source(rng: Generator, kind: str) -> Source:
         at = np.array([rng.uniform(-3.4, 3.4), rng.uniform(0.3, 2.1), rng.uniform(-1.2, 4.5)])
     else:
         around, up, away = rng.uniform(-np.pi, np.pi), rng.uniform(0.05, 1.4), rng.uniform(1.5, 5.5)
-        direction = np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
-        at = target + away * direction
+        at = target + away * direction(around, up)
         at[1], at[2] = max(at[1], 0.4), max(at[2], -2.2)
     return Source(form, at, target, float(size[form]))  # type: ignore[arg-type]

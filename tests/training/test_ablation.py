@@ -59,6 +59,8 @@ def test_photos_are_of_scenes_that_no_row_trains_on(renders, maps, tmp_path) -> 
     assert all(np.array_equal(taken[name], again[name]) for name in taken)
     with pytest.raises(InputError, match="not 2"):
         take_photos(renders, tmp_path / "more", without=maps / LUMI, scenes=2)
+    with pytest.raises(InputError, match="There are no scenes in"):
+        take_photos(tmp_path, tmp_path / "none")
 
 
 def noisy_mini() -> Mini:

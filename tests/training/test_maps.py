@@ -7,7 +7,7 @@ import pytest
 
 from dior_rt.errors import InputError
 from dior_rt.training.maps import EXPONENT, KINDS, LUMI, SPECULAR, Shot, Stages, render_maps, with_maps
-from dior_rt.training.render import Shapes, Stage, View, _emitter
+from dior_rt.training.render import Shapes, Stage, View, emitter_of
 from dior_rt.training.scenes import Camera, Material, Source, Thing
 from dior_rt.training.shapes import box
 
@@ -131,7 +131,7 @@ def test_only_the_phong_map_and_shading_turn_with_the_view() -> None:
 def test_maps_of_sources_add(kind) -> None:
     things = (wall(RED), shelf(plain((0.3, 0.6, 0.9), "plastic")))
     stages = Stages.load(things)
-    lamp = {"other": _emitter(OTHER)}
+    lamp = {"other": emitter_of(OTHER)}
     both = Stages(
         *(
             Stage(Shapes(stage.original.things | lamp), Shapes(stage.white.things | lamp))

@@ -134,7 +134,7 @@ def render_all(sources, colors, samples: int) -> np.ndarray:
     mi = mitsuba()
     emitters = {}
     for k, (source, color) in enumerate(zip(sources, colors, strict=True)):
-        emitter = render._emitter(source)
+        emitter = render.emitter_of(source)
         emitter["emitter"]["radiance"]["value"] = list(color)
         emitters[f"source{k}"] = emitter
     described = {
@@ -179,7 +179,7 @@ def on_surface(source: Source) -> np.ndarray:
     if source.kind == "spot":
         return source.at[None]
     mi = mitsuba()
-    to_world = np.array(render._emitter(source)["to_world"].matrix)
+    to_world = np.array(render.emitter_of(source)["to_world"].matrix)
     square = np.concatenate([rng.uniform(-1, 1, (500, 2)), [[-1, -1], [-1, 1], [1, -1], [1, 1]]])
     local = np.column_stack([square, np.zeros(len(square)), np.ones(len(square))])
     assert mi.variant() == "scalar_rgb"

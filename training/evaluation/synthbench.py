@@ -38,7 +38,7 @@ from dior_rt.training.evaluation.people import person
 from dior_rt.training.evaluation.tasks import OPS, Task
 from dior_rt.training.render import DOMAINS, Stage, View, lit, mitsuba, view
 from dior_rt.training.scenes import Camera, Scene
-from dior_rt.training.triplets import DIMMEST, Pair, pair, random_lights
+from dior_rt.training.triplets import Pair, pair, random_lights, usable_sources
 
 MOST_COPY: Final = 15.0  # dB
 DRAWS: Final = 200  # of lights in a scene, before the next scene is tried
@@ -98,8 +98,6 @@ def make(number: int, recipe: Recipe) -> Task:
         camera = described.cameras[0]
         stage = Stage.load(described.things)
         described = lit(stage, described, camera)
-        if not described.sources:
-            continue
         preview = view(stage, described, camera, scene_number, recipe.resolution // 2, PREVIEW)
         seed = differing(preview)
         if seed is None:
@@ -131,7 +129,7 @@ def differing(preview: View) -> list[int] | None:
 def used(preview: View, seed: list[int]) -> NDArray[np.bool_]:
     """(sources,) which are lit in either picture of the pair that the seed draws."""
     rng = np.random.default_rng(seed)
-    usable = preview.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST
+    usable = usable_sources(preview)
     lights = random_lights(rng, usable) + random_lights(rng, usable)
     return np.asarray(lights.any(axis=1))
 
