@@ -45,7 +45,7 @@ def test_same_bytes_for_any_number_of_threads(bundle, hold, precision):
 
 @pytest.mark.parametrize(("precision", "alone"), [("fp32", 2e-6), ("fp16", 1e-2), ("int8", 1e-1)])
 def test_velocity_in_a_batch_and_alone(velocity, usual_feeds, hold, precision, alone):
-    """ONNX Runtime sums the time of a picture alone in another order than a batch's: the last bits may differ.
+    """ONNX Runtime sums the time of a lone picture in another order than a batch's: last bits may differ.
     In int8 the range of a whole batch decides how its activations are rounded."""
     feeds = {name: array[[0, 3, 5]] for name, array in usual_feeds.items()}
     rows = [{name: array[i : i + 1] for name, array in feeds.items()} for i in range(3)]
