@@ -36,10 +36,11 @@ Raster = NDArray[np.float32]
 Grids = tuple[tuple[int, int], ...]  # (rows, columns) in cells
 
 GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
-CHANGES = ("change", "local")  # of one light
+CHANGES = ("change", "local")  # of one light, or of one place
 KINDS = (*CHANGES, "replace", "keep")
 KIND_SHARES = (0.2, 0.38, 0.32, 0.1)
-DABS = {"change": 0.15, "local": 0.4, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
+DABS = {"change": 0.15, "local": 0.5, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
+GELS = 0.5  # the share of local changes that are of all lights alike
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
 DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
@@ -109,6 +110,12 @@ def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lig
     return changed
 
 
+def gel(rng: Generator) -> Raster:
+    """(3,) what all lights of a place are strengthened or dimmed by, and tinted: up to three stops either
+    way, so that twice the light drawn is twice the light, whichever lights make it."""
+    return np.float32(2 ** rng.uniform(-3, 3)) * tint(rng)
+
+
 def exposed(image: Raster, white: float) -> float:
     """The exposure that brings an image's 95th percentile to `white`."""
     return white / max(float(np.percentile(image.max(axis=2), 95)), 1e-4)
@@ -140,7 +147,9 @@ def pair(
     kind = kind or str(rng.choice(KINDS, p=KIND_SHARES))
     lights = random_lights(rng, usable)
     relights = lights
-    if kind in CHANGES:
+    if kind == "local" and rng.uniform() < GELS:
+        relights = lights * gel(rng)
+    elif kind in CHANGES:
         relights = change_one(rng, lights, usable)
     elif kind == "replace":
         relights = random_lights(rng, usable)

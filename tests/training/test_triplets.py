@@ -9,6 +9,7 @@ from scipy.ndimage import label
 
 from dior_rt.family import mini
 from dior_rt.kernels import NumpyOps, Strokes
+from dior_rt.training import triplets
 from dior_rt.training.camera import Camera, random_camera
 from dior_rt.training.network import decode_light, linear_to_srgb
 from dior_rt.training.triplets import (
@@ -192,6 +193,17 @@ def test_local_changes_leave_more_of_the_picture(views) -> None:
         return float(np.mean(shares))
 
     assert still("local") > still("change") + 0.1
+
+
+def test_a_gel_changes_pictures_and_maps_by_one_factor(views, monkeypatch) -> None:
+    monkeypatch.setattr(triplets, "GELS", 1.0)
+    stops = []
+    for _, sample in pairs(views, "local"):
+        whole = (sample.photo < 1) & (sample.relit < 1)
+        one, other = sample.relit * sample.source, sample.photo * sample.target
+        np.testing.assert_allclose(one[whole], other[whole], rtol=1e-3, atol=1e-6)
+        stops.append(np.log2((sample.target + 1e-3) / (sample.source + 1e-3)))
+    assert max(change.max() for change in stops) > 1 and min(change.min() for change in stops) < -1
 
 
 def test_flags_let_light_pass_in_one_part() -> None:
