@@ -24,7 +24,7 @@ from PIL import Image, ImageFile, PngImagePlugin, TiffImagePlugin, UnidentifiedI
 from PIL.ExifTags import IFD, Base
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from dior_rt.deep import LEVEL, is_deep, read_deep, write_png, write_tiff
+from dior_rt.deep import STRATEGY, is_deep, read_deep, write_png, write_tiff
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, check_writable, reason, replacing
 from dior_rt.metadata import DAMAGE, KEY, keep_exif, read_dpi, stamp
@@ -260,7 +260,7 @@ def _write_png(file: IO[bytes], samples: Pixels, photo: Photo, settings: Mapping
     info = PngImagePlugin.PngInfo()
     if samples.dtype == np.uint8:
         info.add_itxt(KEY, json.dumps(settings))
-        return _save(file, samples, photo, photo.exif, format="PNG", pnginfo=info, compress_level=LEVEL)
+        return _save(file, samples, photo, photo.exif, format="PNG", pnginfo=info, compress_type=STRATEGY)
     if photo.icc:
         info.add(b"iCCP", b"ICC profile\0\0" + zlib.compress(photo.icc))
     if photo.dpi:
