@@ -23,8 +23,8 @@ from dior_rt.profiles import Pixels
 
 Deep = NDArray[np.uint16]
 
-#: How zlib packs, in every file: what prediction leaves of a photo's rows seldom repeats, so that looking for more
-#: than runs costs time, and space too.
+#: How zlib packs, in every file: what prediction leaves of a photo's rows seldom repeats, so looking for more than
+#: runs costs time, and space too.
 STRATEGY = zlib.Z_RLE
 
 _ROWS = 64  # rows a strip: compressed one by one, so that a 100-megapixel picture needs no second copy
@@ -71,7 +71,7 @@ def write_png(file: IO[bytes], samples: Deep, info: PngImagePlugin.PngInfo) -> N
     above = np.zeros((1, width * channels * 2), np.uint8)
     for top in range(0, height, _ROWS):
         rows = samples[top : top + _ROWS].astype(">u2").view(np.uint8).reshape(-1, above.shape[1])
-        filtered = rows - np.concatenate([above, rows[:-1]])  # filter 2, "up": each byte less the one above it
+        filtered = rows - np.concatenate([above, rows[:-1]])  # filter 2, "up": less the byte above
         above = rows[-1:]
         PngImagePlugin.putchunk(file, b"IDAT", packer.compress(np.insert(filtered, 0, 2, axis=1).tobytes()))
     PngImagePlugin.putchunk(file, b"IDAT", packer.flush())
