@@ -23,8 +23,8 @@ from dior_rt.profiles import Pixels
 
 Deep = NDArray[np.uint16]
 
-#: How zlib packs, in every file: what prediction leaves of a photo's rows seldom repeats, so looking for more than
-#: runs costs time, and space too.
+#: How zlib packs, in every file: what prediction leaves of a photo's rows seldom repeats, and to look for
+#: more than runs of bytes costs time, and space too.
 STRATEGY = zlib.Z_RLE
 
 _ROWS = 64  # rows a strip: compressed one by one, so that a 100-megapixel picture needs no second copy
