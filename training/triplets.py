@@ -36,11 +36,11 @@ Raster = NDArray[np.float32]
 Grids = tuple[tuple[int, int], ...]  # (rows, columns) in cells
 
 GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
-CHANGES = ("change", "local")  # of one light, or of one place
+CHANGES = ("change", "local", "dab")  # of one light, of one place, and of the place of a lone dab
 KINDS = (*CHANGES, "replace", "keep")
-KIND_SHARES = (0.2, 0.38, 0.32, 0.1)
-DABS = {"change": 0.15, "local": 0.5, "replace": 0.0, "keep": 0.3}  # the share of pairs with a lone dab
-GELS = 0.5  # the share of local changes that are of all lights alike
+KIND_SHARES = (0.17, 0.25, 0.22, 0.28, 0.08)
+GELS = {"local": 0.6, "dab": 1.0}  # the share of changes that are of all lights alike
+STOPS = 4.0  # by which these change, at most
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
 DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
@@ -111,9 +111,12 @@ def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lig
 
 
 def gel(rng: Generator) -> Raster:
-    """(3,) what all lights of a place are strengthened or dimmed by, and tinted: up to three stops either
-    way, so that twice the light drawn is twice the light, whichever lights make it."""
-    return np.float32(2 ** rng.uniform(-3, 3)) * tint(rng)
+    """(3,) what all lights of a place are strengthened or dimmed by, and tinted.
+
+    Were it mostly next to 1, what is drawn would tell what light is there, and half the light drawn would
+    not be taken at its word.
+    """
+    return np.float32(2 ** rng.uniform(-STOPS, STOPS)) * tint(rng)
 
 
 def exposed(image: Raster, white: float) -> float:
@@ -147,22 +150,21 @@ def pair(
     kind = kind or str(rng.choice(KINDS, p=KIND_SHARES))
     lights = random_lights(rng, usable)
     relights = lights
-    if kind == "local" and rng.uniform() < GELS:
-        relights = lights * gel(rng)
-    elif kind in CHANGES:
-        relights = change_one(rng, lights, usable)
+    if kind in CHANGES:
+        alike = kind in GELS and rng.uniform() < GELS[kind]
+        relights = lights * gel(rng) if alike else change_one(rng, lights, usable)
     elif kind == "replace":
         relights = random_lights(rng, usable)
     photo, source = mix(view, lights * balance)
     relit, target = mix(view, relights * balance)
-    if kind == "local":
+    if kind in ("local", "dab"):
         passing = flag(rng, photo.shape[:2])[..., None]
         relit, target = photo + passing * (relit - photo), source + passing * (target - source)
     exposure, strength = exposed(photo, rng.uniform(0.3, 1.1)), 1.0
     # A picture lost in white teaches little. One changed light must stay itself beside the others, so the
     # exposure gives way to it; lights that replace all others may be as strong as suits. But a person may
     # draw light that burns a place out, and has to see it burn.
-    if kind in CHANGES and not burnt:
+    if kind in ("change", "local") and not burnt:
         exposure = min(exposure, exposed(relit, rng.uniform(0.9, 1.5)))
     elif kind == "replace":
         strength = exposed(relit, 2 ** rng.uniform(0, 2) if burnt else rng.uniform(0.3, 1.1)) / exposure
@@ -206,7 +208,7 @@ def interest(sample: Pair) -> Raster:
 def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     """Light (h, w, 3) and mask (h, w) that a person might have drawn for the pair, at grid size."""
     seed = int(rng.integers(2**31))
-    if rng.uniform() < DABS[sample.kind]:
+    if sample.kind == "dab":
         mask = dab(rng, interest(sample))
         return flat(sample.target, mask), mask
     if sample.kind in CHANGES and rng.uniform() < 0.85:
