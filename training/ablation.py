@@ -25,11 +25,13 @@ from dior_rt.family import mini
 from dior_rt.grid import GridRule
 from dior_rt.kernels import Strokes
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.sampler import draw_noise, sample
+from dior_rt.schedule import ShiftSchedule
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.evaluation.baselines import quotient
 from dior_rt.training.evaluation.benchmarks import renders as benchmarks
 from dior_rt.training.evaluation.control import response
-from dior_rt.training.evaluation.metrics import Photo
+from dior_rt.training.evaluation.metrics import Photo, Raster
 from dior_rt.training.evaluation.results import Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.run import MEASURES
 from dior_rt.training.evaluation.tasks import DRAWN, OPS, Task
@@ -45,6 +47,7 @@ PAIRS: Final = ("replace", "change")  # of every held-out view
 STILL: Final = ("keep",)  # what the brush visits: pictures under their own light
 GRID: Final = GridRule(cells=1024, multiple=4)
 GRIDS: Final = ((32, 32), (28, 40), (40, 28))
+SCHEDULE: Final = ShiftSchedule(Plan.shift)  # as flow times are drawn in training
 EXAMPLES: Final = 3  # of a row, for the contact sheet
 
 LAMPS: Final = "strokes of the Lumi map"
@@ -128,10 +131,20 @@ def train(
 
 
 @dataclass(frozen=True)
+class Walk:
+    """How the flow is walked: by Euler's steps, from noise of a strength; from none to the mean answer."""
+
+    steps: int = 1
+    noise: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
 class Network:
-    """A network in torch that relights as the runtime does, in one step without noise: the mean answer."""
+    """A network in torch that relights as the runtime does."""
 
     network: nn.Module
+    walk: Walk = Walk()
 
     @staticmethod
     def load(folder: Path) -> Network:
@@ -139,20 +152,27 @@ class Network:
         base = load_network(folder / WEIGHTS)
         return Network(PeftModel.from_pretrained(base, str(folder / LORA)).eval())  # type: ignore[arg-type]
 
-    @torch.no_grad()
     def relight(self, photo: Photo, strokes: Strokes) -> Photo:
         """The photo (H, W, 3) under strokes of its size."""
+        return OPS.transfer(photo, *self.light(photo, strokes))
+
+    @torch.no_grad()
+    def light(self, photo: Photo, strokes: Strokes) -> tuple[Raster, Raster]:
+        """The photo on the light grid, and relit; (h, w, 3), linear."""
         grid = GRID.shape(*photo.shape[:2])
         source = OPS.reduce_photo(photo, grid)
         encoded = np.clip(linear_to_srgb(source), 0, 1).astype(np.float32)
         drawn = OPS.reduce_strokes(strokes.light, strokes.mask, grid)
         condition = mini.encode(encoded, drawn, "relight")
         inputs: dict[str, Tensor] = {name: torch.from_numpy(value) for name, value in condition.items()}
-        # From x = 0 at sigma = 1 to 0: x0 = 0 - velocity.
-        x0 = -self.network(x=torch.zeros_like(inputs["photo"]), sigma=torch.ones(1), **inputs)
-        relit = (inputs["photo"] + x0 / float(mini.RELIT_SCALE)).clamp(0, 1)[0].permute(1, 2, 0)
-        linear = srgb_to_linear(relit.contiguous().numpy()).astype(np.float32)
-        return OPS.transfer(photo, source, linear)
+
+        def velocity(x: Raster, sigma: float) -> Raster:
+            return self.network(x=torch.from_numpy(x), sigma=torch.tensor([sigma]), **inputs).numpy()
+
+        noise = np.float32(self.walk.noise) * draw_noise(self.walk.seed, condition["photo"].shape)
+        *_, end = sample(velocity, noise, SCHEDULE.sigmas(self.walk.steps))
+        relit = np.clip(condition["photo"] + end.x / mini.RELIT_SCALE, 0, 1)[0].transpose(1, 2, 0)
+        return source, srgb_to_linear(np.ascontiguousarray(relit)).astype(np.float32)
 
 
 Scores = dict[str, list[float]]  # by measure, one a picture

@@ -293,6 +293,35 @@ def ablation(
     typer.echo(markdown([evaluation]))
 
 
+@app.command()
+def recipes(
+    renders: Annotated[Path, typer.Argument(help="Folder of renders to train on.")],
+    held_out: Annotated[Path, typer.Argument(help="Folder of other scenes' renders, to judge by.")],
+    out: Annotated[Path, typer.Option(help="Folder of the networks and the report; resumable.")],
+    steps: Annotated[
+        int, typer.Option(min=2, help="Of what ships; the other recipes take as many as cost the same.")
+    ] = 400,
+    batch: Annotated[int, typer.Option(min=1)] = 8,
+    precision: Precision = "no",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Train small networks by several recipes at equal cost, and compare them.
+
+    Where the flow starts (noise, a regression, the photo, an estimate), and the network's shape. All see the
+    same batches; what is trained is kept, so a study that stopped goes on.
+    """
+    from dataclasses import replace
+
+    from dior_rt.training.evaluation.report import markdown, write_report
+    from dior_rt.training.recipes import PLAN, study, total_steps
+
+    plan = replace(PLAN, steps=steps, batch=batch, precision=precision, seed=seed)
+    with _Bar(total_steps(plan)) as bar:
+        evaluation, examples = study(renders, held_out, out, plan, progress=bar.show)
+    write_report(out, [evaluation], examples)
+    typer.echo(markdown([evaluation]))
+
+
 class _Bar:
     """A progress bar on a terminal; elsewhere a line every hundred steps."""
 

@@ -42,9 +42,10 @@ class Plan:
     The rate warms up, stays, and falls to 0 over the last fifth of the steps, so a longer plan can resume
     from any state that came before the fall. average: the half-life of the weights' average, in steps.
     clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. silent: the
-    share of samples whose noise is 0, as it is where sampling starts from the noise's mean. own: how the
-    error of the photo's own light counts beside that of x0. precision: as accelerate names it. compiled: by
-    torch.compile, which takes minutes and then nearly halves a step's time on CPUs. grids: see `Batches`.
+    share of samples whose noise is 0, as it is where sampling starts from the noise's mean. noise: how
+    strong it is in the others. own: how the error of the photo's own light counts beside that of x0.
+    precision: as accelerate names it. compiled: by torch.compile, which takes minutes and then nearly
+    halves a step's time on CPUs. grids: see `Batches`.
     """
 
     steps: int
@@ -58,6 +59,7 @@ class Plan:
     shift: float = 8.0
     always_noise: float = 0.85
     silent: float = 0.7
+    noise: float = 1.0
     own: float = 0.25
     seed: int = 0
     precision: Literal["no", "bf16"] = "no"
@@ -129,8 +131,9 @@ def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
 
 
 def draw_loud(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
-    """(count, 1, 1, 1): 0 for the share of samples without noise, and 1."""
-    return (torch.rand(count, generator=generator) >= plan.silent).float()[:, None, None, None]
+    """(count, 1, 1, 1): 0 for the share of samples without noise, and the noise's strength."""
+    loud = torch.rand(count, generator=generator) >= plan.silent
+    return plan.noise * loud.float()[:, None, None, None]
 
 
 def run(
