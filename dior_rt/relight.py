@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dior_rt.adaptive import sample_within
-from dior_rt.bundle import MOST_STEPS, Bundle, default_bundle, read_bundle
+from dior_rt.bundle import Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
 from dior_rt.family import Family
 from dior_rt.family.mini import Mini
@@ -238,7 +238,8 @@ class Relighter:
         if how.tolerance is None:
             sigmas = self._sigmas(condition, how.steps, how.shift)
             return sample(self._velocity(condition, sigmas, how), noise, sigmas, how.solver)
-        family, sigmas = self._family, self._sigmas(condition, MOST_STEPS, how.shift)
+        # The reference's own stops: a finer schedule ends nearer the image, and that is another answer.
+        family, sigmas = self._family, self._sigmas(condition, self.bundle.manifest.steps, how.shift)
 
         def distance(one: Array, other: Array) -> float:
             """RMS of the light grid's pictures, sRGB-encoded 0..1."""

@@ -135,8 +135,7 @@ def test_a_tolerance_tells_the_steps_it_took_and_progress_jumps_to_the_end(relig
         photo, STROKES, tolerance=20 / 255, progress=lambda step, steps: seen.append((step, steps))
     )
     assert relit.steps == len(seen) and relit.sampling.tolerance == 20 / 255
-    assert [step for step, _ in seen] == sorted({step for step, _ in seen}) and seen[-1] == (1000, 1000)
-    assert relit.steps < 200
+    assert [step for step, _ in seen] == sorted({step for step, _ in seen}) and seen[-1] == (4, 4)
 
 
 def relight(folder: Path, photo: np.ndarray, *options: str) -> int:

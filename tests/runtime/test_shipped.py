@@ -62,3 +62,11 @@ def test_red_strokes_redden_and_blue_ones_turn_blue(relighter, photo, brushed):
     red = under_the_brush(relighter, photo, brushed, [2.0, 0.4, 0.4])
     blue = under_the_brush(relighter, photo, brushed, [0.4, 0.4, 2.0])
     assert red[0] / red[2] > 1.5 * blue[0] / blue[2]
+
+
+def test_a_tolerance_holds_against_the_reference_and_takes_fewer_steps(relighter, photo, brushed):
+    strokes = Strokes(np.full(photo.shape, 1.5, np.float32), brushed.astype(np.float32))
+    reference = relighter.relight(photo, strokes)
+    within = relighter.relight(photo, strokes, tolerance=0.5 / 255)
+    error = (within.picture.astype(np.float64) - reference.picture) / 255
+    assert within.steps < reference.steps / 2 and np.sqrt(np.mean(error**2)) < 0.5 / 255
