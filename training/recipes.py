@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.utils.data import IterableDataset
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -34,8 +34,9 @@ from dior_rt.training.evaluation.metrics import Photo, border_ratio, psnr
 from dior_rt.training.evaluation.results import Evaluation, Example, Row, Table
 from dior_rt.training.evaluation.tasks import DRAWN, Task
 from dior_rt.training.fit import Batch, Plan, Progress, Stream, flow_loss, run
-from dior_rt.training.network import WEIGHTS, Config, Mini, load_network, save_network, velocity
+from dior_rt.training.network import WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.triplets import Batches, load_views
+from dior_rt.training.variants import AboutEstimate, sever
 
 EXAMPLES: Final = 2  # of a row, for the contact sheet
 CONTROL: Final = "The light is cut from the true Lumi map of the target."
@@ -269,39 +270,6 @@ def _network(recipe: Recipe, small: Config, base: nn.Module | None) -> nn.Module
 def _blank(recipe: Recipe, small: Config) -> nn.Module:
     """A network of the recipe's shape."""
     return _network(recipe, small, Mini(recipe.config(small)) if recipe.after else None)
-
-
-class AboutEstimate(nn.Module):
-    """A flow about the answer m of a frozen network: of z = x - (1 - sigma) m, whose image is x0 - m.
-
-    Where z has the velocity u, x has u - m, so this is a network like any other. The flow's own answer is
-    a relit picture; less m it is the middle of z's Gaussian.
-    """
-
-    def __init__(self, estimate: nn.Module, flow: nn.Module) -> None:
-        super().__init__()
-        self.estimate, self.flow = deepcopy(estimate).requires_grad_(False), flow
-
-    def forward(
-        self, x: Tensor, sigma: Tensor, with_own: bool = False, **seen: Tensor
-    ) -> Tensor | tuple[Tensor, Tensor]:
-        """As `Mini`'s; seen: photo, light, mask and mode."""
-        middle = -self.estimate(x=torch.zeros_like(x), sigma=torch.ones_like(sigma), **seen)
-        s = sigma[:, None, None, None]
-        towards, own = self.flow(x=x - (1 - s) * middle, sigma=sigma, with_own=True, **seen)
-        # A velocity is linear in the state and in the answer that is expected, which `middle` is taken from.
-        towards = towards - velocity(torch.zeros_like(x), s, middle) - middle
-        return (towards, own) if with_own else towards
-
-
-def sever(network: Mini) -> None:
-    """Let no convolution after the transformer look beyond its own cell, now and in training."""
-    for layer in (network.blend_quarter.blend, network.blend_half.blend, network.smooth, network.head):
-        own = torch.zeros(layer.kernel_size)
-        own[1, 1] = 1
-        with torch.no_grad():
-            layer.weight *= own
-        layer.weight.register_hook(own.mul)  # of the gradient; AdamW leaves at 0 what is and has none
 
 
 def judge(

@@ -21,16 +21,15 @@ from dior_rt.training.recipes import (
     HALF,
     ONCE,
     RECIPES,
-    AboutEstimate,
     Recipe,
     Shared,
     at_equal_cost,
     cost,
-    sever,
     step_cost,
     study,
 )
 from dior_rt.training.triplets import Batches
+from dior_rt.training.variants import AboutEstimate, sever
 
 TINY = Config(width=32, depth=1, heads=2, patch=4, fine=8, half=16, quarter=32)
 SHORT = Plan(steps=4, batch=2, warmup=1, average=1, rate=4e-3, grids=((16, 16),))
@@ -199,7 +198,7 @@ def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_
                 assert figures[AHEAD].mean == pytest.approx(figures["PSNR"].mean - base["PSNR"].mean)
     # All began alike, and learnt different things; what was severed is still so.
     networks = {recipe: load_network(tmp_path / recipe.folder / WEIGHTS) for recipe in plans}
-    assert len({float(network.head.weight.sum()) for network in networks.values()}) == len(plans)
+    assert len({network.head.weight.sum().item() for network in networks.values()}) == len(plans)
     assert networks[rows[4]].head.weight[:, :, 1, 1].any()
     assert torch.count_nonzero(networks[rows[4]].head.weight) == 9 * TINY.fine
 
