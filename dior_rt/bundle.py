@@ -25,7 +25,7 @@ from dior_rt.grid import GridRule
 from dior_rt.records import parse, read_json, unparse
 from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 MANIFEST = "manifest.json"
 MOST_MANIFEST_BYTES = 1 << 20
 MOST_STEPS = 1000
@@ -67,7 +67,7 @@ class Manifest:
     parity: figures measured at export. settings: the family's own numbers and words.
     """
 
-    format: Literal[1] = FORMAT
+    format: Literal[2] = FORMAT
     family: Literal["mini", "qwen"]
     name: str
     licence: str
@@ -183,8 +183,9 @@ def _read_manifest(folder: Path) -> Manifest:
     try:
         document = read_json(folder / MANIFEST, MOST_MANIFEST_BYTES)
         version = document.get("format") if isinstance(document, dict) else None
-        if type(version) is int and version > FORMAT:
-            raise ValueError(f"it has format {version}, and this dior-rt reads {FORMAT}: update dior-rt")
+        if type(version) is int and version != FORMAT:
+            way = "update dior-rt" if version > FORMAT else "export its model again"
+            raise ValueError(f"it has format {version}, and this dior-rt reads {FORMAT}: {way}")
         return parse(Manifest, document)
     except FileNotFoundError:
         raise BundleError(f"{folder} is no bundle: it has no {MANIFEST}.") from None

@@ -63,8 +63,8 @@ def check_sampling(
 
 def run(graphs: mini.Graphs, feeds: Feeds) -> Array:
     """The velocity that the two graphs compute for the inputs of one evaluation."""
-    features = graphs.encode.run({name: feeds[name] for name in mini.SEEN})
-    return graphs.velocity.run({name: feeds[name] for name in ("x", "sigma", "mode")} | features)["velocity"]
+    step = {name: feeds[name] for name in ("x", "sigma", "mode")}
+    return graphs.velocity.run(step | graphs.features(feeds))["velocity"]
 
 
 def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:

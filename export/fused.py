@@ -50,10 +50,10 @@ def fused(network: Mini) -> Mini:
     return other
 
 
-def encode_fused(network: Mini, photo: Tensor, light: Tensor, mask: Tensor) -> Features:
+def encode_fused(network: Mini, photo: Tensor, light: Tensor, mask: Tensor, own: Tensor) -> Features:
     """The network's features, and in them the biases of what is divided: here each of the cells that come of
     one has its own, and a transposed convolution has one for all of them."""
-    features = network.encode(photo, light, mask)
+    features = network.encode(photo, light, mask, own)
     factor = network.config.patch // 4
     return features._replace(
         quarter=features.quarter + _tiled(network.unembed.bias, factor, features.tokens),

@@ -126,12 +126,15 @@ class Encode(torch.nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, photo: torch.Tensor, light: torch.Tensor, mask: torch.Tensor) -> Features:
-        return encode_fused(self.network, photo, light, mask)
+    def forward(
+        self, photo: torch.Tensor, light: torch.Tensor, mask: torch.Tensor, own: torch.Tensor
+    ) -> Features:
+        return encode_fused(self.network, photo, light, mask, own)
 
     def feeds(self, height: int, width: int, seed: int) -> Feeds:
         feeds = random_feeds(height, width, seed)
-        return {name: feeds[name] for name in mini.SEEN}
+        own = np.random.default_rng(seed).random(feeds["photo"].shape, dtype=np.float32)
+        return {name: feeds[name] for name in mini.SEEN} | {"own": own}
 
 
 class Step(torch.nn.Module):
@@ -161,7 +164,7 @@ class Step(torch.nn.Module):
 
     def feeds(self, height: int, width: int, seed: int) -> Feeds:
         feeds = random_feeds(height, width, seed)
-        features = answers(Encode(self.network), {name: feeds[name] for name in mini.SEEN})
+        features = answers(Encode(self.network), Encode(self.network).feeds(height, width, seed))
         return {name: feeds[name] for name in ("x", "sigma", "mode")} | features
 
 

@@ -58,7 +58,7 @@ def fit(
     batch: Annotated[int, typer.Option(min=1)] = 32,
     rate: Annotated[float, typer.Option(min=0, help="Peak learning rate.")] = 8e-4,
     width: Annotated[int, typer.Option(min=8, help="Of a token; a multiple of 4 times the heads.")] = 256,
-    depth: Annotated[int, typer.Option(min=1)] = 6,
+    depth: Annotated[int, typer.Option(min=1)] = 8,
     heads: Annotated[int, typer.Option(min=1)] = 8,
     precision: Precision = "no",
     compiled: Annotated[bool, typer.Option("--compile", help="Minutes at first, then faster steps.")] = False,

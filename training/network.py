@@ -5,12 +5,13 @@ answer across the tokens' borders. The heads are physical. To relight, a log-rat
 
     relit = (photo + e) exp(r) - e        in linear light, e = 0.02
 
-    r = raw + log((drawn + b) / (own + b))    under a stroke, b = 0.05: the light that has bounced
+    r = raw + log((drawn + b) / (own + b))    under a stroke, b = 0.02: the light that has bounced
     r = raw + what strokes say elsewhere      beside strokes, as far as learnt gates let it reach
 
 so a network that has learnt nothing returns the photo where nothing is drawn, black can still be lit, and
-twice the drawn value is twice the light. `own`, the photo's own Lumi map, is the answer to estimate. The
-velocity is that of a narrow Gaussian about the answer.
+twice the drawn value is twice the light. `own`, the photo's own Lumi map, is the answer to estimate; it is
+taken from the photo alone, before the strokes are seen. The velocity is that of a narrow Gaussian about the
+answer.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ LORA = "lora"
 FLOOR = 0.02  # e above: what a ratio is guarded with where the photo is black
 RELIT_SCALE = 4.0
 LUMI_SCALE = 8.0
-BOUNCED = 0.05  # light where no source shines: it has bounced there, and drawn darkness is no black hole
+BOUNCED = 0.02  # light where no source shines: it has bounced there, and drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
 LITTLE = 0.01  # of the cells around drawn: half of what is said there holds
 CLOSED = 2.0  # gates begin an eighth open
@@ -58,7 +59,7 @@ class Config:
     """
 
     width: int = 256
-    depth: int = 6
+    depth: int = 8
     heads: int = 8
     patch: int = 8
     fine: int = 16
@@ -141,10 +142,11 @@ def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
 
 class Features(NamedTuple):
     """What does not depend on the flow. given: photo, photo in linear light, its light if it were white
-    paper (encoded), the log of 8 (drawn light + b), mask, and how the strokes reach a cell, see `_reach`;
-    cosine, sine: of the tokens' places, see `rotations`; the others are what convolutions see."""
+    paper (encoded), and the drawn light over the photo's own, as logarithms: under strokes, then on average
+    of those nearby, farther off and everywhere for the cells beside them; cosine, sine: of the tokens'
+    places, see `rotations`; the others are what convolutions see."""
 
-    given: Tensor  # (B, 16, h, w)
+    given: Tensor  # (B, 21, h, w)
     fine: Tensor  # (B, 16, h, w)
     half: Tensor  # (B, 64, h / 2, w / 2)
     quarter: Tensor  # (B, 128, h / 4, w / 4)
@@ -167,6 +169,7 @@ class Mini(nn.Module):
         self.see = nn.Conv2d(18, fine, 3, padding=1)
         self.see_half = nn.Conv2d(fine, half, 4, 2, 1)
         self.see_quarter = nn.Conv2d(half, quarter, 4, 2, 1)
+        self.refine = Refine(quarter)
         self.embed = nn.Conv2d(quarter, width, patch // 4, patch // 4)
         self.embed_state = nn.Conv2d(3, width, patch, patch)
         self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
@@ -196,12 +199,22 @@ class Mini(nn.Module):
         with_own: bool = False,
     ) -> Tensor | tuple[Tensor, Tensor]:
         """The velocity; and, where asked for, what the network takes for the photo's own light, encoded."""
-        relit, own = self._answers(x, sigma, mode, self.encode(photo, light, mask))
-        towards = _towards(relit, own, x, sigma, mode)
+        own = self.own_light(photo)
+        towards = self.step(x, sigma, mode, *self.encode(photo, light, mask, own))
         return (towards, own) if with_own else towards
 
-    def encode(self, photo: Tensor, light: Tensor, mask: Tensor) -> Features:
-        """What photo and strokes say, whatever the flow's state."""
+    def own_light(self, photo: Tensor) -> Tensor:
+        """(B, 3, h, w) the light on a photo, encoded: the estimate, without strokes and from a silent state.
+
+        Were the strokes seen, the answer would lean towards them, since light that is drawn tends to be like
+        the light that is there; and twice the light drawn would be less than twice the light.
+        """
+        none, sigma = torch.zeros_like(photo), torch.ones_like(photo[:, 0, 0, 0])
+        blank = self.encode(photo, none, none[:, :1], none)
+        return self._answers(none, sigma, sigma.long(), blank)[1]
+
+    def encode(self, photo: Tensor, light: Tensor, mask: Tensor, own: Tensor) -> Features:
+        """What photo and strokes say, whatever the flow's state; own: the light on the photo, encoded."""
         linear = srgb_to_linear(photo)
         white, aim = encode_light(linear), torch.log(LUMI_SCALE * (light + BOUNCED))
         # Where the light would have to go on white paper.
@@ -211,8 +224,11 @@ class Mini(nn.Module):
         seen = torch.cat([2 * photo - 1, encode_light(light) * mask, *said], dim=1)
         fine = F.silu(self.see(seen))
         half = F.silu(self.see_half(fine))
-        quarter = F.silu(self.see_quarter(half))
-        given = torch.cat([photo, linear, white, aim, mask, self._shares(mask)], dim=1)
+        quarter = self.refine(F.silu(self.see_quarter(half)))
+        # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
+        brightness = torch.exp(own.clamp(0.0, BRIGHTEST) * math.log1p(LUMI_SCALE))  # 1 + 8 light
+        known = mask * (aim - torch.log(brightness - (1 - LUMI_SCALE * BOUNCED)))
+        given = torch.cat([photo, linear, white, known, *self._beside(known, mask)], dim=1)
         tokens = self.embed(quarter)
         batch, _, rows, columns = tokens.shape
         turns = rotations(rows, columns, self.config.width // self.config.heads, photo.device)
@@ -242,33 +258,26 @@ class Mini(nn.Module):
         given, fine, half, quarter, tokens, cosine, sine = features
         clear = clarity(sigma)
         heard = 1 - (1 - sigma) * clear  # where the state says nothing, neither does the time
-        condition = F.silu(self.time(waves(heard, self.config.width)) + self.mode(mode))  # (B, width)
+        condition = F.silu(self.time(_twice(waves(heard, self.config.width))) + _twice(self.mode(mode)))
         turns = cosine.flatten(1, 2), sine.flatten(1, 2)  # (B, rows * columns, width / heads / 2)
         seen = x * clear[:, None, None, None]
         cells = self._transform(tokens + self.embed_state(seen), condition, turns)  # (B, 128, h / 4, w / 4)
         cells = self.blend_quarter(cells + quarter)  # (B, 64, h / 2, w / 2)
         cells = self.blend_half(cells + half)  # (B, 16, h, w)
-        state = self.see_state(seen) * self.state_gate(condition)[:, :, None, None]
+        state = self.see_state(seen) * self.state_gate(condition)[: x.shape[0], :, None, None]
         cells = F.silu(self.smooth(cells + fine + state))
         raw, own, gates = self.head(cells).float().split(3, dim=1)  # (B, 3, h, w)
-        photo, linear, white, aim, mask, shares = given.split((3, 3, 3, 3, 1, 3), dim=1)
-        own = white + own  # the photo's own light, encoded; of white paper it is the photo itself
-        # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
-        brightness = torch.exp(own.clamp(0.0, BRIGHTEST) * math.log1p(LUMI_SCALE))  # 1 + 8 light
-        drawn = mask * (aim - torch.log(brightness - (1 - LUMI_SCALE * BOUNCED)))
-        return _relight(photo, linear, raw + drawn + self._reach(drawn, gates, shares)), own
+        photo, linear, white, known, nearby, farther, anywhere = given.split(3, dim=1)
+        # Gates say how much of what is drawn nearby, farther off, and everywhere holds beside the strokes.
+        near, far, wide = torch.sigmoid(gates - CLOSED).split(1, dim=1)
+        ratio = raw + known + near * nearby + far * farther + wide * anywhere
+        # Of white paper the light, encoded, is the photo itself.
+        return _relight(photo, linear, ratio), white + own
 
-    def _reach(self, drawn: Tensor, gates: Tensor, shares: Tensor) -> Tensor:
-        """How the light of the strokes goes on beside them: gates say how much of what is drawn nearby,
-        farther off, and everywhere holds for a cell."""
-        near, far, wide = (torch.sigmoid(gates - CLOSED) * shares).split(1, dim=1)
-        nearby, farther, anywhere = self._means(drawn)
-        return near * nearby + far * farther + wide * anywhere
-
-    def _shares(self, mask: Tensor) -> Tensor:
-        """Make `_reach`'s three means those of what is drawn, and let them say nothing under the strokes."""
-        drawn = torch.cat([means.expand_as(mask) for means in self._means(mask)], dim=1)
-        return (1 - mask) / (drawn + LITTLE)
+    def _beside(self, known: Tensor, mask: Tensor) -> list[Tensor]:
+        """What the strokes say on average nearby, farther off and everywhere, for every cell beside them."""
+        drawn = zip(self._means(known), self._means(mask), strict=True)
+        return [(1 - mask) * said / (share + LITTLE) for said, share in drawn]
 
     def _means(self, cells: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(B, C, h, w) on average around every cell, farther around, and everywhere (B, C, 1, 1)."""
@@ -278,13 +287,16 @@ class Mini(nn.Module):
         return _smooth(small, size), _smooth(large, 2 * size), everywhere(large)
 
     def _transform(self, tokens: Tensor, condition: Tensor, turns: Turns) -> Tensor:
-        """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells."""
+        """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells.
+
+        condition: (2 B, width), of which the first half counts.
+        """
         rows, columns = tokens.shape[2:]
         tokens = tokens.flatten(2).transpose(1, 2)  # (B, rows * columns, width)
         # All blocks' at once, (B, depth * 6, width): six vectors are little to work on.
         about = torch.tensor([0.0, 1, 0, 0, 1, 0], device=tokens.device)[:, None]  # scales begin at 1
         offsets = torch.stack([block.get_parameter("offset") for block in self.blocks]) + about
-        modulation = self.modulation(condition).unflatten(1, (1, 6, -1)) + offsets
+        modulation = self.modulation(condition)[: tokens.shape[0]].unflatten(1, (1, 6, -1)) + offsets
         vectors = modulation.flatten(1, 2).split(1, dim=1)
         for index, block in enumerate(self.blocks):
             tokens = block(tokens, vectors[6 * index : 6 * index + 6], turns)
@@ -313,6 +325,19 @@ class Divide(nn.Conv2d):
 
     def forward(self, cells: Tensor) -> Tensor:
         return F.pixel_shuffle(super().forward(cells), 2)
+
+
+class Refine(nn.Module):
+    """What the surroundings add to every cell's features: (B, C, h, w) to the same. Nothing at first."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.look, self.add = nn.Conv2d(size, size, 3, padding=1), nn.Conv2d(size, size, 3, padding=1)
+        for weight in self.add.parameters():
+            nn.init.zeros_(weight)
+
+    def forward(self, cells: Tensor) -> Tensor:
+        return cells + self.add(F.silu(self.look(cells)))
 
 
 class Blend(nn.Module):
@@ -369,6 +394,12 @@ def clarity(sigma: Tensor) -> Tensor:
     network has answered so far, however faint in it, must not be taken for a word about the truth."""
     image, noise = (1 - sigma) ** 2, (MURK * sigma) ** 2
     return image / (image + noise)
+
+
+def _twice(rows: Tensor) -> Tensor:
+    """A product of one row is summed in another order than one of several; with every row twice a lone
+    picture has the same last bits as in a batch."""
+    return torch.cat([rows, rows])
 
 
 def waves(sigma: Tensor, width: int) -> Tensor:

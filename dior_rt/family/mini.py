@@ -22,7 +22,7 @@ from dior_rt.schedule import ShiftSchedule
 MODES: Final[dict[Mode, int]] = {"relight": 0, "estimate": 1}
 RELIT_SCALE: Final = np.float32(4)
 LUMI_SCALE: Final = np.float32(8)
-SEEN: Final = ("photo", "light", "mask")  # what the graph "encode" looks at
+SEEN: Final = ("photo", "light", "mask")  # of a condition, what the graph "encode" looks at
 
 
 class Mini:
@@ -87,13 +87,29 @@ class Graphs:
 
     def bind(self, condition: Condition) -> Velocity:
         """The velocity under a condition, whose features are computed and go to the device once."""
-        features = self.encode.run({name: condition[name] for name in SEEN})
-        binding = self.velocity.bind({"mode": condition["mode"], **features})
+        binding = self.velocity.bind({"mode": condition["mode"], **self.features(condition)})
 
         def velocity(x: Array, sigma: float) -> Array:
             return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
 
         return velocity
+
+    def features(self, condition: Condition) -> Condition:
+        """What a step is told of photo and strokes. What is drawn is measured against the photo's own light,
+        so where anything is, that is estimated first: an evaluation without strokes from a silent state."""
+        seen = {name: condition[name] for name in SEEN}
+        blank = {**null(seen), "own": np.zeros_like(seen["photo"])}
+        if not seen["mask"].any():
+            return self.encode.run(blank)
+        return self.encode.run({**seen, "own": self._own_light(self.encode.run(blank))})
+
+    def _own_light(self, blank: Condition) -> Array:
+        """The light on a photo, encoded, from the features of it alone."""
+        count, _, height, width = blank["given"].shape
+        state = np.zeros((count, 3, height, width), np.float32)
+        asked = {"sigma": np.ones(count, np.float32), "mode": np.full(count, MODES["estimate"], np.int64)}
+        # From x = 0 at sigma = 1 the velocity is -x0, and x0 is 2 own - 1.
+        return (1 - self.velocity.run({"x": state, **asked, **blank})["velocity"]) / 2
 
 
 def _planes(pixels: Array) -> Array:

@@ -72,7 +72,8 @@ def test_what_is_written_is_read_back(tmp_path, files, manifest):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda d: d.update(format=2), "format 2"),
+        (lambda d: d.update(format=3), "format 3, and this dior-rt reads 2: update"),
+        (lambda d: d.update(format=1), "format 1, and this dior-rt reads 2: export its model again"),
         (lambda d: d.update(format="1"), "format"),
         (lambda d: d.update(family="maxi"), "family"),
         (lambda d: d.update(surprise=1), "unknown key 'surprise'"),
@@ -113,7 +114,7 @@ def test_a_manifest_that_is_not_right_is_refused(folder, change, says):
         "{",
         "[]",
         "null",
-        '{"format": 1, "format": 1}',
+        '{"format": 2, "format": 2}',
         '{"format": NaN}',
         "[" * 100_000,
         "\xff",

@@ -20,7 +20,7 @@ from onnx.reference.op_run import OpRun
 
 from dior_rt.bundle import Bundle
 from dior_rt.family import Family
-from dior_rt.family.mini import null
+from dior_rt.family.mini import MODES, null
 from dior_rt.kernels import Strokes
 from dior_rt.sampler import draw_noise
 
@@ -160,8 +160,13 @@ class Network:
         self._encode, self._velocity = Graph(bundle.path("encode")), Graph(bundle.path("velocity"))
 
     def run(self, feeds: Mapping[str, NDArray]) -> Array:
-        """The velocity for the inputs of one evaluation."""
-        return self._velocity.run({**feeds, **self._encode.run(feeds)})["velocity"]
+        """The velocity for the inputs of one evaluation, with the photo's own light estimated first."""
+        none = np.zeros_like(feeds["photo"])
+        blank = self._encode.run({**feeds, "light": none, "mask": none[:, :1], "own": none})
+        count = len(none)
+        asked = {"x": none, "sigma": np.ones(count), "mode": np.full(count, MODES["estimate"])}
+        own = (1 - self._velocity.run({**asked, **blank})["velocity"]) / 2
+        return self._velocity.run({**feeds, **self._encode.run({**feeds, "own": own})})["velocity"]
 
     def velocity(self, condition: Mapping[str, NDArray], guidance: float) -> Velocity:
         """v_null + guidance (v_cond - v_null) of mini's graph."""

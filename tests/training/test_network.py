@@ -125,6 +125,15 @@ def test_every_input_matters_but_light_that_is_not_specified(awake) -> None:
 
 
 @torch.no_grad()
+def test_the_photo_s_own_light_does_not_depend_on_strokes_state_or_time(awake) -> None:
+    given, other = inputs(), inputs(seed=1)
+    own = awake(**given, with_own=True)[1]
+    for changed in ({**other, "photo": given["photo"]}, {**given, "light": 16 * given["light"]}):
+        torch.testing.assert_close(awake(**changed, with_own=True)[1], own, atol=0, rtol=0)
+    assert not torch.equal(awake(**other, with_own=True)[1], own)
+
+
+@torch.no_grad()
 def test_every_cell_sees_the_whole_grid(awake) -> None:
     given = inputs(16, 16, 1)
     moved = {**given, "photo": given["photo"].clone()}
