@@ -45,15 +45,15 @@ class Engine:
         device: str = "cpu",
         threads: int | None = None,
         reason: str = "",
-        arena: bool = True,
+        keep: bool = True,
     ) -> None:
-        """Load `model`. threads, arena: as `open_session` takes them.
+        """Load `model`. threads, keep: as `open_session` takes them.
 
         Raises DeviceError for a device that is not there, BundleError for a file that is no ONNX graph.
         """
         self.device = device
         self.reason = reason or f"{device} was asked for"
-        self._session = open_session(model, device, threads, arena)
+        self._session = open_session(model, device, threads, keep)
         self.inputs = tuple(map(_tensor, self._session.get_inputs()))
         self.outputs = tuple(map(_tensor, self._session.get_outputs()))
         # Only the CPU's provider promises to run one session from several threads at once.
@@ -104,7 +104,7 @@ class Binding:
 
 
 def open_engine(
-    bundle: Bundle, graph: str, device: str = "auto", threads: int | None = None, *, arena: bool = True
+    bundle: Bundle, graph: str, device: str = "auto", threads: int | None = None, *, keep: bool = True
 ) -> Engine:
     """Load a graph of a bundle on a device, and hold it to the bundle's own answer.
 
@@ -112,17 +112,17 @@ def open_engine(
     why. Raises DeviceError for a device that is not there or computes wrong results, and BundleError.
     """
     if device != "auto":
-        return _open_tested(bundle, graph, device, threads, arena=arena)
+        return _open_tested(bundle, graph, device, threads, keep=keep)
     failures = []
     for name in accelerators():
         try:
             return _open_tested(
-                bundle, graph, name, threads, f"{name} is there and passes its self-test", arena
+                bundle, graph, name, threads, f"{name} is there and passes its self-test", keep
             )
         except DeviceError as error:
             failures.append(str(error))
     reason = " ".join(failures) or "ONNX Runtime finds no accelerator here"
-    return _open_tested(bundle, graph, "cpu", threads, reason, arena)
+    return _open_tested(bundle, graph, "cpu", threads, reason, keep)
 
 
 def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
@@ -152,9 +152,9 @@ def _multiple(side: int | str) -> int:
 
 
 def _open_tested(
-    bundle: Bundle, graph: str, device: str, threads: int | None, reason: str = "", arena: bool = True
+    bundle: Bundle, graph: str, device: str, threads: int | None, reason: str = "", keep: bool = True
 ) -> Engine:
-    engine = Engine(bundle.path(graph), device, threads, reason, arena)
+    engine = Engine(bundle.path(graph), device, threads, reason, keep)
     promised = bundle.manifest.graphs[graph]
     if (engine.inputs, engine.outputs) != (promised.inputs, promised.outputs):
         raise BundleError(

@@ -62,13 +62,14 @@ def accelerators() -> list[str]:
     return [f"{name}:{choice}" if choice else name for name, choice in choices.items()]
 
 
-def open_session(model: Path, device: str, threads: int | None, arena: bool = True) -> ort.InferenceSession:
+def open_session(model: Path, device: str, threads: int | None, keep: bool = True) -> ort.InferenceSession:
     """Load a graph on a device, which takes all of it but the operations that it lacks; the CPU takes those.
 
-    threads: CPU threads for one operation; None leaves it to ONNX Runtime. arena: keep a run's memory for the
-    next, which is faster; of many graphs that take turns, each would keep as much. Raises DeviceError for a
-    device that is not there or cannot be started, BundleError for a file that is no ONNX graph, and
-    InputError for threads below 1.
+    threads: CPU threads for one operation; None leaves it to ONNX Runtime. keep: memory and threads for the
+    next run, which is faster; of graphs that take turns each would keep as much from the others.
+
+    Raises DeviceError for a device that is not there or cannot be started, BundleError for a file that is no
+    ONNX graph, and InputError for threads below 1.
     """
     name, _, choice = device.partition(":")
     if name not in available() or (choice and not PROVIDERS[name].choice):
@@ -77,7 +78,7 @@ def open_session(model: Path, device: str, threads: int | None, arena: bool = Tr
     options = {**provider.options, **({provider.choice: choice} if choice else {})}
     try:
         session = _start(
-            model, {provider.ort_name: options, cpu.ort_name: {}}, _session_options(name, threads, arena)
+            model, {provider.ort_name: options, cpu.ort_name: {}}, _session_options(name, threads, keep)
         )
     except _ORT_ERRORS as error:
         # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
@@ -97,9 +98,11 @@ def translated(device: str) -> Iterator[None]:
         raise DeviceError(f"{device} failed: {reason(error)}.") from error
 
 
-def _session_options(name: str, threads: int | None, arena: bool) -> ort.SessionOptions:
+def _session_options(name: str, threads: int | None, keep: bool) -> ort.SessionOptions:
     options = ort.SessionOptions()
-    options.enable_cpu_mem_arena = arena
+    options.enable_cpu_mem_arena = keep
+    if not keep:  # threads that wait for their next work hold a core
+        options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 3
     if threads is not None:
         if threads < 1:

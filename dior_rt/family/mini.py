@@ -35,7 +35,9 @@ class Mini:
             raise BundleError(f"{bundle.folder} is no complete bundle of the family mini.")
         self._grid, self._schedule = grid, schedule
         velocity = open_engine(bundle, "velocity", device, threads)
-        self._graphs = Graphs(open_engine(bundle, "encode", velocity.device, threads), velocity)
+        self._graphs = Graphs(
+            encode=open_engine(bundle, "encode", velocity.device, threads, keep=False), velocity=velocity
+        )
         self.device, self.reason = velocity.device, velocity.reason
 
     def raster(self, height: int, width: int) -> tuple[int, int]:

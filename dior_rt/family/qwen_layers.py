@@ -37,7 +37,7 @@ class Layers:
         """
         self._bundle, self._threads = bundle, threads
         self.memory = _free_memory() * SHARE if memory is None else memory
-        engine = open_engine(bundle, first, device, threads, arena=False)
+        engine = open_engine(bundle, first, device, threads, keep=False)
         self.device, self.reason = engine.device, engine.reason
         self._kept = {first: engine}
         self._bytes = self.size(first)
@@ -52,7 +52,7 @@ class Layers:
         with self._lock:
             if name in self._kept:
                 return self._kept[name]
-            engine = open_engine(self._bundle, name, self.device, self._threads, arena=False)
+            engine = open_engine(self._bundle, name, self.device, self._threads, keep=False)
             size = self.size(name)
             if self._bytes + size <= self.memory:
                 self._kept[name] = engine
