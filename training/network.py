@@ -284,7 +284,9 @@ class Mini(nn.Module):
         size = self.config.patch // 2
         small = F.avg_pool2d(cells, size)
         large = F.avg_pool2d(small, 2)
-        return _smooth(small, size), _smooth(large, 2 * size), everywhere(large)
+        # Of the cells and not of the large ones: their count is a multiple of 64, so that sums start aligned
+        # and a picture alone has the same bits as in a batch.
+        return _smooth(small, size), _smooth(large, 2 * size), everywhere(cells)
 
     def _transform(self, tokens: Tensor, condition: Tensor, turns: Turns) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells.
