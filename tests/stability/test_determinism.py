@@ -1,8 +1,9 @@
 """Determinism: one seed, one answer.
 
 On one device a picture's bytes are the same, run after run, for any number of threads; on another device
-they are at most 1/255 away. The velocity of a picture is the same alone and in a batch, for any number of
-threads; but in int8, where the range of a whole batch decides how activations are rounded.
+they are at most 1/255 away. The velocity is the same for any number of threads, and on up to three of them
+the same alone and in a batch; on five, encode's first convolution is divided otherwise for a lone picture,
+and in int8 the range of a whole batch decides how activations are rounded.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def test_same_bytes_for_any_number_of_threads(bundle, hold, precision):
         hold("picture, 1 to 5 threads, twice", precision, picture, pictures[0], 0, "1/255")
 
 
-@pytest.mark.parametrize(("precision", "alone"), [("fp32", 0), ("fp16", 0), ("int8", 1e-1)])
+@pytest.mark.parametrize(("precision", "alone"), [("fp32", 2e-6), ("fp16", 1e-2), ("int8", 1e-1)])
 def test_velocity_in_a_batch_and_alone(velocity, usual_feeds, hold, precision, alone):
     feeds = {name: array[[0, 3, 5]] for name, array in usual_feeds.items()}
     rows = [{name: array[i : i + 1] for name, array in feeds.items()} for i in range(3)]
@@ -54,7 +55,9 @@ def test_velocity_in_a_batch_and_alone(velocity, usual_feeds, hold, precision, a
         got = velocity(feeds, precision, threads)
         hold("velocity, 1 to 5 threads", precision, got, want, 0, "largest value", scale)
         got = np.concatenate([velocity(row, precision, threads) for row in rows])
-        hold("velocity, row by row", precision, got, want, alone, "largest value", scale)
+        exact = threads <= 3 and precision != "int8"
+        case = f"velocity, row by row, {'up to 3' if threads <= 3 else '5'} threads"
+        hold(case, precision, got, want, 0 if exact else alone, "largest value", scale)
 
 
 @pytest.mark.parametrize("dtype", TOP)
