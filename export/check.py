@@ -64,7 +64,7 @@ def check_sampling(
 def run(graphs: mini.Graphs, feeds: Feeds) -> Array:
     """The velocity that the two graphs compute for the inputs of one evaluation."""
     step = {name: feeds[name] for name in ("x", "sigma", "mode")}
-    return graphs.velocity.run(step | graphs.features(feeds))["velocity"]
+    return graphs.velocity.run({**step, **graphs.features(feeds)})["velocity"]
 
 
 def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:

@@ -108,10 +108,14 @@ class Graphs:
     def _own_light(self, blank: Condition) -> Array:
         """The light on a photo, encoded, from the features of it alone."""
         count, _, height, width = blank["given"].shape
-        state = np.zeros((count, 3, height, width), np.float32)
-        asked = {"sigma": np.ones(count, np.float32), "mode": np.full(count, MODES["estimate"], np.int64)}
-        # From x = 0 at sigma = 1 the velocity is -x0, and x0 is 2 own - 1.
-        return (1 - self.velocity.run({"x": state, **asked, **blank})["velocity"]) / 2
+        asked: Condition = {
+            "x": np.zeros((count, 3, height, width), np.float32),
+            "sigma": np.ones(count, np.float32),
+            "mode": np.full(count, MODES["estimate"], np.int64),
+        }
+        velocity: Array = self.velocity.run({**asked, **blank})["velocity"]
+        # From x = 0 at sigma = 1 it is -x0, and x0 is 2 own - 1.
+        return (np.float32(1) - velocity) / np.float32(2)
 
 
 def _planes(pixels: Array) -> Array:

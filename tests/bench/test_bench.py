@@ -201,7 +201,7 @@ def test_operations_of_a_network_counted_by_hand(mini_bundle: Path, guidance: fl
     cells, width, patch = rows * columns, network.width, network.patch
     fine, half, quarter = network.fine, network.half, network.quarter
     tokens = cells // patch**2
-    once = width * width * 2 + width * 6 * width + width * fine  # time, modulation, the state's gate
+    once = 2 * (width * width * 2 + width * 6 * width + width * fine)  # twice: time, modulation, state's gate
     block = tokens * width * (3 * width + width + 8 * width) + 2 * tokens * tokens * width
     ends = tokens * width * (3 * patch**2 + quarter * (patch // 4) ** 2)  # the state's tokens, unembed
     blends = cells // 16 * quarter * (9 * quarter + 4 * half) + cells // 4 * half * (9 * half + 4 * fine)
