@@ -67,7 +67,8 @@ def eager() -> Callable[[Condition], Velocity]:
     @torch.inference_mode()
     def bind(condition: Condition) -> Velocity:
         given = {name: torch.from_numpy(array) for name, array in condition.items()}
-        features = network.encode(given["photo"], given["light"], given["mask"])
+        own = network.own_light(given["photo"])
+        features = network.encode(given["photo"], given["light"], given["mask"], own)
 
         @torch.inference_mode()
         def velocity(x: Array, sigma: float) -> Array:
