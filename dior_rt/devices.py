@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from dior_rt.bundle import Bundle
 from dior_rt.engine import open_engine
 from dior_rt.errors import DiorError
-from dior_rt.kernels import KernelError, list_devices, open_device, open_ops
+from dior_rt.kernels import KernelError, check_device, list_devices, open_ops
 from dior_rt.providers import PROVIDERS, available
 
 
@@ -57,7 +57,7 @@ def survey_ops() -> Survey:
     try:
         for device in list_devices():
             try:
-                open_device(device)
+                check_device(device)
                 problem = None
             except KernelError as error:
                 problem = str(error)

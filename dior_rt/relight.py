@@ -97,7 +97,15 @@ class Relighter:
             with _device_errors():
                 self._ops = opening.result()
         self.device, self.device_reason = self._family.device, self._family.reason
-        self.ops, self.ops_reason = self._ops.name, self._ops.reason
+
+    @property
+    def ops(self) -> str:
+        """What runs the pixel kernels. Under "auto" NumPy takes over from a device that computes wrongly."""
+        return self._ops.name
+
+    @property
+    def ops_reason(self) -> str:
+        return self._ops.reason
 
     @property
     def presets(self) -> tuple[str, ...]:

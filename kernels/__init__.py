@@ -8,7 +8,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from dior_rt.kernels.devices import Device, list_devices, open_device, open_ops, prepare_caches
+from dior_rt.kernels.devices import (
+    Device,
+    check_device,
+    list_devices,
+    open_device,
+    open_ops,
+    prepare_caches,
+)
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
 from dior_rt.kernels.selftest import self_test
@@ -25,6 +32,7 @@ __all__ = [
     "Ops",
     "Stroke",
     "Strokes",
+    "check_device",
     "list_devices",
     "open_device",
     "open_ops",

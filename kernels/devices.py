@@ -13,6 +13,7 @@ from typing import Any
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
 from dior_rt.kernels.selftest import self_test
+from dior_rt.kernels.tested import TestedOps
 from dior_rt.kernels.types import KernelError
 
 
@@ -71,12 +72,12 @@ def prepare_caches() -> None:
 
 
 def open_ops(name: str = "auto") -> Ops:
-    """The Ops of that name, self-tested; `reason` says why it was chosen.
+    """The Ops of that name, see `open_device`; `reason` says why it was chosen.
 
     "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose
     name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that
-    fails gives way to the next, and the reason says so. Raises KernelError where what was named cannot be
-    had."""
+    cannot be opened gives way to the next, and one that fails later to NumPy; the reason says so. Raises
+    KernelError where what was named cannot be had."""
     if name == "numpy":
         return NumpyOps()
     if name == "auto":
@@ -92,13 +93,20 @@ def open_ops(name: str = "auto") -> Ops:
     return open_device(devices[0])
 
 
-def open_device(device: Device) -> Ops:
-    """The Ops of one device, self-tested. Raises KernelError if it cannot be opened or computes wrongly."""
+def open_device(device: Device, spare: Ops | None = None) -> TestedOps:
+    """The Ops of one device. An operation is tried before its first use; where it fails, `spare` takes over.
+
+    Raises KernelError if the device cannot be opened, or fails what every 8-bit photo needs first."""
     from dior_rt.kernels.opencl_ops import OpenCLOps
 
-    ops = OpenCLOps(device)
-    self_test(ops)
-    return ops
+    return TestedOps(OpenCLOps(device), spare)
+
+
+def check_device(device: Device) -> None:
+    """Try every operation on a device. Raises KernelError that says what is wrong with it."""
+    from dior_rt.kernels.opencl_ops import OpenCLOps
+
+    self_test(OpenCLOps(device))
 
 
 def by_preference(devices: list[Device]) -> list[Device]:
@@ -115,7 +123,7 @@ def _choose_best() -> Ops:
         devices, problems = [], [str(error)]
     for device in devices:
         try:
-            ops = open_device(device)
+            ops = open_device(device, spare=NumpyOps())
         except KernelError as error:
             problems.append(str(error))
             continue

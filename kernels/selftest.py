@@ -1,4 +1,4 @@
-"""Does a device compute what the NumPy twin computes? Asked once, before it is trusted with a picture."""
+"""Does a device compute what the NumPy twin computes? Asked before it is trusted with a picture."""
 
 from __future__ import annotations
 
@@ -14,17 +14,25 @@ from dior_rt.kernels.types import KernelError, Stroke, Strokes
 
 #: Of the pictures: odd, and so wide that a cell of the grid holds more pixels than any device has lanes.
 SIZE, GRID = (37, 149), (5, 7)
+FLOAT = np.dtype(np.float32)
 
 Case = tuple[str, Callable[[Ops], np.ndarray | Strokes], float]
 
 
 def self_test(ops: Ops, dtypes: tuple[npt.DTypeLike, ...] = (np.uint8,)) -> None:
-    """Run every op on a small fixed picture of each dtype. Raises KernelError that says what is wrong.
+    """Try every operation, on small pictures of each dtype. Raises KernelError that says what is wrong."""
+    for dtype in map(np.dtype, dtypes):
+        for op in ("decode", "encode", "reduce_photo", "transfer"):
+            try_op(ops, op, dtype)
+    try_op(ops, "reduce_strokes", FLOAT, FLOAT)
+    for op in ("draw_strokes", "cut", "coarsen"):
+        try_op(ops, op)
 
-    One dtype is enough to know a device; the kernels of another are built, for a second or two, when first
-    used."""
+
+def try_op(ops: Ops, op: str, *dtypes: np.dtype) -> None:
+    """Run one operation on a small picture of its dtypes. Raises KernelError that says what is wrong."""
     twin = NumpyOps()
-    for name, run, tolerance in _cases(dtypes):
+    for name, run, tolerance in _cases(op, *dtypes):
         try:
             got, expected = _arrays(run(ops)), _arrays(run(twin))
         except Exception as error:  # whatever a driver may throw
@@ -40,30 +48,42 @@ def self_test(ops: Ops, dtypes: tuple[npt.DTypeLike, ...] = (np.uint8,)) -> None
                 raise KernelError(f"{ops.name} failed its self-test of {name}: {wrong}")
 
 
-def _cases(dtypes: tuple[npt.DTypeLike, ...]) -> Iterator[Case]:
-    """(op, how to run it, largest difference allowed)."""
+def _cases(op: str, *dtypes: np.dtype) -> Iterator[Case]:
+    """(what is tried, how to run it, largest difference allowed)."""
     rng = np.random.default_rng(20)
     light = rng.random((*SIZE, 3), np.float32)
     mask = np.where(rng.random(SIZE) < 0.3, rng.random(SIZE, np.float32), 0)
-    narrow = rng.random((2, GRID[0], 60, 3), np.float32)  # cells of two pixels
-    strokes = [
-        Stroke(((3.0, 4.0), (40.0, 20.0), (10.0, 33.0)), 6.0, (1.0, 0.5, 0.2), 2.0, 0.5),
-        Stroke(((50.0, 30.0),), 0.3, (0.0, 1.0, 4.0)),
-    ]
-    for dtype in (np.dtype(kind) for kind in dtypes):
-        picture = NumpyOps().encode_srgb(light, dtype)
-        exact = 2e-6 if dtype == np.float32 else 0
-        step = {"uint8": 1, "uint16": 3}.get(dtype.name, 1e-5)
-        yield f"decode_srgb of {dtype}", partial(Ops.decode_srgb, picture=picture), 2e-6
-        yield f"encode_srgb to {dtype}", partial(Ops.encode_srgb, linear=light, dtype=dtype), exact
-        yield f"reduce_photo of {dtype}", partial(Ops.reduce_photo, picture=picture, grid=GRID), 1e-5
-        for columns, (source, relit) in {60: narrow, 2: narrow[:, :, :2]}.items():
-            relight = partial(Ops.transfer, photo=picture, source=source, relit=relit)
-            yield f"transfer of {dtype} from {columns} columns", relight, step
-    yield "reduce_strokes", partial(Ops.reduce_strokes, light=light, mask=mask, grid=GRID), 1e-5
-    yield "draw_strokes", partial(Ops.draw_strokes, strokes=strokes, size=SIZE), 1e-4
-    yield "sparsify to strokes", partial(Ops.sparsify, lumi=light, mode="strokes", seed=1), 0
-    yield "sparsify to coarse cells", partial(Ops.sparsify, lumi=light, mode="coarse", seed=1), 1e-5
+    encode = NumpyOps().encode_srgb
+    match op, *dtypes:
+        case "decode", dtype:
+            yield f"decode_srgb of {dtype}", partial(Ops.decode_srgb, picture=encode(light, dtype)), 2e-6
+        case "encode", dtype:
+            exact = 2e-6 if dtype == FLOAT else 0
+            yield f"encode_srgb to {dtype}", partial(Ops.encode_srgb, linear=light, dtype=dtype), exact
+        case "reduce_photo", dtype:
+            picture = encode(light, dtype)
+            yield f"reduce_photo of {dtype}", partial(Ops.reduce_photo, picture=picture, grid=GRID), 1e-5
+        case "transfer", dtype:
+            step = {"uint8": 1, "uint16": 3}.get(dtype.name, 1e-5)
+            for columns in (60, 2):  # cells of two pixels, and wide ones
+                source, relit = rng.random((2, GRID[0], columns, 3), np.float32)
+                relight = partial(Ops.transfer, photo=encode(light, dtype), source=source, relit=relit)
+                yield f"transfer of {dtype} from {columns} columns", relight, step
+        case "reduce_strokes", of_light, of_mask:
+            drawn = light if of_light == FLOAT else encode(light, of_light)
+            share = mask if of_mask == FLOAT else np.round(mask * np.iinfo(of_mask).max).astype(of_mask)
+            reduce = partial(Ops.reduce_strokes, light=drawn, mask=share, grid=GRID)
+            yield f"reduce_strokes of {of_light}, mask {of_mask}", reduce, 1e-5
+        case ("draw_strokes",):
+            strokes = [
+                Stroke(((3.0, 4.0), (40.0, 20.0), (10.0, 33.0)), 6.0, (1.0, 0.5, 0.2), 2.0, 0.5),
+                Stroke(((50.0, 30.0),), 0.3, (0.0, 1.0, 4.0)),
+            ]
+            yield "draw_strokes", partial(Ops.draw_strokes, strokes=strokes, size=SIZE), 1e-4
+        case ("cut",):
+            yield "sparsify to strokes", partial(Ops.sparsify, lumi=light, mode="strokes", seed=1), 0
+        case ("coarsen",):
+            yield "sparsify to coarse cells", partial(Ops.sparsify, lumi=light, mode="coarse", seed=1), 1e-5
 
 
 def _arrays(result: np.ndarray | Strokes) -> list[np.ndarray]:

@@ -62,6 +62,10 @@ def fit(
     heads: Annotated[int, typer.Option(min=1)] = 8,
     precision: Precision = "no",
     compiled: Annotated[bool, typer.Option("--compile", help="Minutes at first, then faster steps.")] = False,
+    edges: Annotated[float, typer.Option(min=0, help="Of the loss on differences between neighbours.")] = 0.5,
+    start: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="model.safetensors to go on from, with its sizes.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:
     """Train the network on renders. `accelerate launch -m dior_rt train fit ...` uses several GPUs."""
@@ -69,9 +73,9 @@ def fit(
     from dior_rt.training.fit import fit as run
     from dior_rt.training.network import Config
 
-    plan = Plan(steps, batch, rate, seed=seed, precision=precision, compiled=compiled)
+    plan = Plan(steps, batch, rate, edges=edges, seed=seed, precision=precision, compiled=compiled)
     with _Bar(steps) as bar:
-        run(renders, out, Config(width, depth, heads), plan, bar.show)
+        run(renders, out, start or Config(width, depth, heads), plan, bar.show)
 
 
 @app.command()

@@ -23,7 +23,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder
 from dior_rt.training.backbone import MiniLora
-from dior_rt.training.network import WEIGHTS, Config, Mini, save_network
+from dior_rt.training.network import WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.state import Average, State
 from dior_rt.training.triplets import GRIDS, Batches, Grids, load_views
 
@@ -44,6 +44,8 @@ class Plan:
     clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. silent: the
     share of samples whose noise is 0, as it is where sampling starts from the noise's mean. noise: how
     strong it is in the others. own: how the error of the photo's own light counts beside that of x0.
+    edges: how the error's differences between neighbouring cells count beside the error: the outline of a
+    stroke that shows where the light goes on is small in error and large to the eye.
     precision: as accelerate names it. compiled: by torch.compile, which takes minutes and then nearly
     halves a step's time on CPUs. grids: see `Batches`.
     """
@@ -61,6 +63,7 @@ class Plan:
     silent: float = 0.7
     noise: float = 1.0
     own: float = 0.25
+    edges: float = 0.0
     seed: int = 0
     precision: Literal["no", "bf16"] = "no"
     compiled: bool = False
@@ -72,18 +75,20 @@ class Plan:
         return self.rate * min(1.0, (step + 1) / self.warmup, max(falling, 0.0))
 
 
-def fit(renders: Path, out: Path, config: Config, plan: Plan, progress: Progress | None = None) -> None:
+def fit(renders: Path, out: Path, start: Config | Path, plan: Plan, progress: Progress | None = None) -> None:
     """Train stage 1 on a folder of renders into the folder `out`; resumes where it holds a state.
 
-    Raises InputError for renders or a state that cannot be used, and where nothing can be written.
+    start: the sizes of a network that has learnt nothing, or the weights of one to go on from. Raises
+    InputError for renders, weights or a state that cannot be used, and where nothing can be written.
     """
     torch.manual_seed(plan.seed)
+    network = Mini(start) if isinstance(start, Config) else load_network(start)
 
     def save(network: nn.Module) -> None:
         assert isinstance(network, Mini)
         save_network(network, out / WEIGHTS)
 
-    run(Mini(config), rendered(renders, plan), out, plan, progress, save)
+    run(network, rendered(renders, plan), out, plan, progress, save)
 
 
 def fit_lora(
@@ -104,11 +109,14 @@ def rendered(renders: Path, plan: Plan) -> Stream:
     return lambda start, rank: Batches(views, plan.batch, plan.seed, start, rank=rank, grids=plan.grids)
 
 
-def flow_loss(network: nn.Module, batch: Batch, sigma: Tensor, noise: Tensor, own: float = 0.0) -> Tensor:
+def flow_loss(
+    network: nn.Module, batch: Batch, sigma: Tensor, noise: Tensor, own: float = 0.0, edges: float = 0.0
+) -> Tensor:
     """Mean squared error of x0 at flow times sigma (B,); the network sees (1 - sigma) x0 + sigma noise.
 
     A batch may carry `weight` (B,), by which each sample's error counts, and `own`, the light on the photo as
     estimation's x0 has it; the error of the network's idea of it counts `own` times as much as that of x0.
+    The differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count `edges` times.
     """
     s = sigma[:, None, None, None]
     x0 = batch["x0"]
@@ -117,10 +125,17 @@ def flow_loss(network: nn.Module, batch: Batch, sigma: Tensor, noise: Tensor, ow
     asked = {"with_own": True} if "own" in batch else {}
     answer = network(x=x, sigma=sigma, **inputs, **asked)
     velocity, light = answer if asked else (answer, None)
-    errors = (x - s * velocity - x0).square().flatten(1).mean(dim=1)  # (B,)
+    error = x - s * velocity - x0
+    errors = _mean_square(error)  # (B,)
+    if edges:
+        errors = errors + edges * (_mean_square(error.diff(dim=2)) + _mean_square(error.diff(dim=3)))
     if light is not None:
-        errors = errors + own * (2 * light - 1 - batch["own"]).square().flatten(1).mean(dim=1)
+        errors = errors + own * _mean_square(2 * light - 1 - batch["own"])
     return (errors * batch["weight"]).mean() if "weight" in batch else errors.mean()
+
+
+def _mean_square(error: Tensor) -> Tensor:
+    return error.square().flatten(1).mean(dim=1)
 
 
 def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
@@ -197,7 +212,7 @@ def _step(accelerator: Accelerator, network: nn.Module, state: State, batch: Bat
     noise = torch.randn(batch["x0"].shape, generator=generator).to(accelerator.device)
     noise *= draw_loud(len(noise), plan, generator).to(accelerator.device)
     with accelerator.autocast():
-        loss = flow_loss(network, batch, sigma, noise, plan.own)
+        loss = flow_loss(network, batch, sigma, noise, plan.own, plan.edges)
     accelerator.backward(loss)
     accelerator.clip_grad_norm_(state.weights, plan.clip)
     state.optimizer.step()

@@ -44,6 +44,8 @@ LUMI_SCALE = 8.0
 BOUNCED = 0.02  # light where no source shines: it has bounced there, and drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
 LITTLE = 0.01  # of the cells around drawn: half of what is said there holds
+EDGE = 1.5  # cells: how softly what is drawn ends beside a stroke
+TOUCHED = 0.05  # the same share within that reach
 CLOSED = 2.0  # gates begin an eighth open
 LARGEST_LOGIT = 8.0
 MURK = 0.1  # noise ten times as strong as the image hides half of the state
@@ -98,13 +100,13 @@ def decode_light(encoded: Tensor) -> Tensor:
     return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
 
 
-def spread(drawn: Tensor, size: int) -> Tensor:
-    """What the strokes say on average some three `size`s around, for every cell, and how much is drawn there.
+def spread(drawn: Tensor, deviation: float) -> Tensor:
+    """What the strokes say on average around every cell, and how much is drawn there.
 
     drawn: (B, 4, h, w), values that are 0 where the mask, the last channel, is. Returns (B, 4, h, w), the
     means over what is drawn, and 0 for nothing drawn, towards 1 from a hundredth of the cells on.
     """
-    return _of_what_is_drawn(around(drawn, size))
+    return _of_what_is_drawn(around(drawn, deviation))
 
 
 def spread_everywhere(drawn: Tensor) -> Tensor:
@@ -112,14 +114,17 @@ def spread_everywhere(drawn: Tensor) -> Tensor:
     return _of_what_is_drawn(everywhere(drawn).expand_as(drawn))
 
 
-def around(cells: Tensor, size: int) -> Tensor:
-    """The mean some three `size`s around every cell, smooth: (B, C, h, w) to the same."""
-    return _smooth(F.avg_pool2d(cells, size), size)
+def around(cells: Tensor, deviation: float) -> Tensor:
+    """The mean around every cell, (B, C, h, w) to the same, by a Gaussian of that many cells."""
+    down, along = (_gaussian(size, deviation, cells) for size in cells.shape[2:])
+    return down @ cells @ along.T
 
 
-def _smooth(means: Tensor, size: int) -> Tensor:
-    """Means of size x size cells, each blended with the eight around it, for every cell."""
-    return F.interpolate(F.avg_pool2d(means, 3, 1, 1), scale_factor=float(size), mode="bilinear")
+def _gaussian(size: int, deviation: float, like: Tensor) -> Tensor:
+    """(size, size): row i are the weights of all cells for cell i, 1 in sum."""
+    place = torch.arange(size, dtype=like.dtype, device=like.device)
+    weights = torch.exp(-0.5 * ((place[:, None] - place) / deviation) ** 2)
+    return weights / weights.sum(dim=1, keepdim=True)
 
 
 def everywhere(cells: Tensor) -> Tensor:
@@ -228,7 +233,7 @@ class Mini(nn.Module):
         # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
         brightness = torch.exp(own.clamp(0.0, BRIGHTEST) * math.log1p(LUMI_SCALE))  # 1 + 8 light
         known = mask * (aim - torch.log(brightness - (1 - LUMI_SCALE * BOUNCED)))
-        given = torch.cat([photo, linear, white, known, *self._beside(known, mask)], dim=1)
+        given = torch.cat([photo, linear, white, *self._said(known, mask)], dim=1)
         tokens = self.embed(quarter)
         batch, _, rows, columns = tokens.shape
         turns = rotations(rows, columns, self.config.width // self.config.heads, photo.device)
@@ -274,19 +279,18 @@ class Mini(nn.Module):
         # Of white paper the light, encoded, is the photo itself.
         return _relight(photo, linear, ratio), white + own
 
-    def _beside(self, known: Tensor, mask: Tensor) -> list[Tensor]:
-        """What the strokes say on average nearby, farther off and everywhere, for every cell beside them."""
-        drawn = zip(self._means(known), self._means(mask), strict=True)
-        return [(1 - mask) * said / (share + LITTLE) for said, share in drawn]
-
-    def _means(self, cells: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(B, C, h, w) on average around every cell, farther around, and everywhere (B, C, 1, 1)."""
-        size = self.config.patch // 2
-        small = F.avg_pool2d(cells, size)
-        large = F.avg_pool2d(small, 2)
-        # Of the cells and not of the large ones: their count is a multiple of 64, so that sums start aligned
-        # and a picture alone has the same bits as in a batch.
-        return _smooth(small, size), _smooth(large, 2 * size), everywhere(cells)
+    def _said(self, known: Tensor, mask: Tensor) -> list[Tensor]:
+        """What is drawn under the strokes, going on beside them as it fades within a few cells; then what
+        strokes say on average nearby, farther off and everywhere, for every cell that this leaves open."""
+        beside, patch = 1 - mask, self.config.patch
+        share = around(mask, EDGE)
+        open_ = beside * (TOUCHED / (share + TOUCHED))
+        means = [(around(known, far), around(mask, far)) for far in (patch / 2, patch)]
+        means.append((everywhere(known), everywhere(mask)))
+        return [
+            known + beside * (around(known, EDGE) / (share + TOUCHED)),
+            *(open_ * (said / (drawn + LITTLE)) for said, drawn in means),
+        ]
 
     def _transform(self, tokens: Tensor, condition: Tensor, turns: Turns) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells.

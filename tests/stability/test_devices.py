@@ -18,7 +18,7 @@ from onnx import helper, numpy_helper
 from dior_rt.bundle import Bundle, default_bundle, read_bundle, write_bundle
 from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import DeviceError
-from dior_rt.kernels import KernelError, OpenCLOps, list_devices, open_device, self_test, session
+from dior_rt.kernels import KernelError, OpenCLOps, check_device, list_devices, self_test, session
 from dior_rt.kernels import opencl_ops as opencl_module
 from dior_rt.providers import available
 
@@ -153,7 +153,7 @@ def test_a_device_that_runs_another_kernel_is_refused(hold, sources, fault):
     assert text.count(right) == 1
     (sources / name).write_text(text.replace(right, wrong), "utf-8")
     with pytest.raises(KernelError, match="failed its self-test"):
-        open_device(OPENCL[0])
+        check_device(OPENCL[0])
     hold(f"kernel: {fault}", "opencl:0", 0, 0, 0, shown="refused")
 
 
@@ -161,7 +161,7 @@ def test_a_device_that_runs_another_kernel_is_refused(hold, sources, fault):
 def test_a_device_with_another_constant_is_refused(hold, monkeypatch):
     monkeypatch.setattr(opencl_module, "EPSILON", 0.021)
     with pytest.raises(KernelError, match="failed its self-test of transfer"):
-        open_device(OPENCL[0])
+        check_device(OPENCL[0])
     hold("kernel: another constant e", "opencl:0", 0, 0, 0, shown="refused")
 
 
