@@ -45,13 +45,14 @@ def check_evaluations(network: torch.nn.Module, graphs: mini.Graphs, grid: GridR
 
 
 def check_sampling(
-    network: torch.nn.Module, bind: Bind, grid: GridRule, sigmas: Array, guidance: float
+    network: torch.nn.Module, graphs: mini.Graphs, grid: GridRule, sigmas: Array, guidance: float
 ) -> float:
     """The lowest PSNR, in dB, between whole runs of the runtime's sampler over the graph and over torch."""
     lowest = math.inf
     for size, mode in product((grid.shape(1, 1), grid.shape(2, 3)), SPAN):
         condition = random_condition(*size, mode, seed=size[0])
-        error = _run(bind, condition, sigmas, guidance) - _run(_bind(network), condition, sigmas, guidance)
+        torch_s = guided(_bind(network), condition, mini.null(condition), guidance)
+        error = _run(graphs.guided(condition, guidance), condition, sigmas) - _run(torch_s, condition, sigmas)
         mean_square = float(np.mean(np.square(error / SPAN[mode], dtype=np.float64)))
         lowest = min(lowest, -10 * math.log10(max(mean_square, 1e-20)))
     if not lowest >= SAMPLING_BAR:
@@ -63,8 +64,8 @@ def check_sampling(
 
 def run(graphs: mini.Graphs, feeds: Feeds) -> Array:
     """The velocity that the two graphs compute for the inputs of one evaluation."""
-    step = {name: feeds[name] for name in ("x", "sigma", "mode")}
-    return graphs.velocity.run({**step, **graphs.features(feeds)})["velocity"]
+    drawn, _ = graphs.branches(feeds)
+    return graphs.velocity.run({"x": feeds["x"], "sigma": feeds["sigma"], **drawn})["velocity"]
 
 
 def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:
@@ -114,9 +115,8 @@ def _all_feeds(grid: GridRule) -> Iterator[Feeds]:
     yield {**usual, "x": 100 * usual["x"]}
 
 
-def _run(bind: Bind, condition: Condition, sigmas: Array, guidance: float) -> Array:
-    noise = draw_noise(1, condition["photo"].shape)
-    *_, last = sample(guided(bind, condition, mini.null(condition), guidance), noise, sigmas)
+def _run(velocity: Velocity, condition: Condition, sigmas: Array) -> Array:
+    *_, last = sample(velocity, draw_noise(1, condition["photo"].shape), sigmas)
     return last.x
 
 

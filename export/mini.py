@@ -108,7 +108,7 @@ def export_network(
         found = mini.Graphs(**engines)
         parity["evaluation"] = check_evaluations(network, found, grid)
         sigmas = recipe.schedule.sigmas(recipe.steps)
-        parity["sampling_db"] = check_sampling(network, found.bind, grid, sigmas, recipe.guidance)
+        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, recipe.guidance)
         graphs = {
             name: Graph(f"{name}.onnx", engine.inputs, engine.outputs, f"{name}.npz")
             for name, engine in engines.items()

@@ -53,7 +53,7 @@ class Mini:
         return self._schedule.sigmas(steps)
 
     def velocity(self, condition: Condition, sigmas: Array, guidance: float) -> Velocity:
-        return guided(self._graphs.bind, condition, null(condition), guidance)
+        return self._graphs.guided(condition, guidance)
 
     def decode_relit(self, x0: Array, condition: Condition) -> Array:
         return _pixels(np.clip(condition["photo"] + x0 / RELIT_SCALE, 0, 1))
@@ -87,23 +87,32 @@ class Graphs:
     encode: Engine
     velocity: Engine
 
-    def bind(self, condition: Condition) -> Velocity:
-        """The velocity under a condition, whose features are computed and go to the device once."""
-        binding = self.velocity.bind({"mode": condition["mode"], **self.features(condition)})
+    def guided(self, condition: Condition, guidance: float) -> Velocity:
+        """The velocity under a condition, and guided away from none: see `dior_rt.sampler.guided`."""
+        drawn, blank = self.branches(condition)
+        return guided(self.bind, drawn, blank, guidance)
+
+    def bind(self, features: Condition) -> Velocity:
+        """The velocity by features, which go to the device once."""
+        binding = self.velocity.bind(features)
 
         def velocity(x: Array, sigma: float) -> Array:
             return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
 
         return velocity
 
-    def features(self, condition: Condition) -> Condition:
-        """What a step is told of photo and strokes. What is drawn is measured against the photo's own light,
-        so where anything is, that is estimated first: an evaluation without strokes from a silent state."""
-        seen = {name: condition[name] for name in SEEN}
-        blank = {**null(seen), "own": np.zeros_like(seen["photo"])}
+    def branches(self, condition: Condition) -> tuple[Condition, Condition]:
+        """What a step is told of photo and strokes, and of the photo alone.
+
+        What is drawn is measured against the photo's own light, so where anything is, that is estimated
+        first: an evaluation without strokes from a silent state.
+        """
+        mode, seen = {"mode": condition["mode"]}, {name: condition[name] for name in SEEN}
+        blank = self.encode.run({**null(seen), "own": np.zeros_like(seen["photo"])})
         if not seen["mask"].any():
-            return self.encode.run(blank)
-        return self.encode.run({**seen, "own": self._own_light(self.encode.run(blank))})
+            return {**mode, **blank}, {**mode, **blank}
+        drawn = self.encode.run({**seen, "own": self._own_light(blank)})
+        return {**mode, **drawn}, {**mode, **blank}
 
     def _own_light(self, blank: Condition) -> Array:
         """The light on a photo, encoded, from the features of it alone."""

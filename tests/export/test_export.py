@@ -199,10 +199,10 @@ def test_a_graph_that_differs_fails_in_one_evaluation(exported, rounded, recipe)
 
 
 def test_a_graph_that_differs_fails_after_all_steps(exported, rounded, recipe):
-    bind, sigmas = open_graphs(exported).bind, ShiftSchedule(8.0).sigmas(4)
-    assert check_sampling(rounded, bind, recipe.grid, sigmas, 2.0) > 100
+    graphs, sigmas = open_graphs(exported), ShiftSchedule(8.0).sigmas(4)
+    assert check_sampling(rounded, graphs, recipe.grid, sigmas, 2.0) > 100
     with pytest.raises(ExportError, match="dB"):
-        check_sampling(spoiled(rounded, by=0.2), bind, recipe.grid, sigmas, 2.0)
+        check_sampling(spoiled(rounded, by=0.2), graphs, recipe.grid, sigmas, 2.0)
 
 
 def test_an_export_over_the_bar_leaves_nothing_behind(exported, network, recipe, tmp_path, monkeypatch):
