@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import product
 from typing import Final
 
@@ -17,9 +18,6 @@ from dior_rt.grid import GridRule
 from dior_rt.kernels import Strokes
 from dior_rt.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 
-EVALUATION_BAR: Final = 1e-4  # largest error of one evaluation, relative to the output's largest value
-SAMPLING_BAR: Final = 60.0  # dB, after all steps
-
 SIGMAS: Final = (1.0, 0.9, 0.5, 0.1, 1e-3)
 SEEDS: Final = (0, 1, 2)
 # How many units of the data variable span black to white.
@@ -28,24 +26,37 @@ SPAN: Final[dict[Mode, float]] = {"relight": 4.0, "estimate": 2.0}
 Bind = Callable[[Condition], Velocity]
 
 
+@dataclass(frozen=True)
+class Bars:
+    """evaluation: the largest error of one, relative to its largest value. sampling: dB, after all steps."""
+
+    evaluation: float
+    sampling: float
+
+
 class ExportError(DiorError):
     """A checkpoint that cannot be exported, or an export that computes something else than its source."""
 
 
-def check_evaluations(network: torch.nn.Module, graphs: mini.Graphs, grid: GridRule) -> float:
+def check_evaluations(network: torch.nn.Module, graphs: mini.Graphs, grid: GridRule, bars: Bars) -> float:
     """The largest relative error of one evaluation, over sigmas, grids, modes, seeds and hostile inputs."""
     worst = 0.0
     for feeds in _all_feeds(grid):
         worst = max(worst, relative_error(run(graphs, feeds), evaluate(network, feeds)))
-    if not worst <= EVALUATION_BAR:
+    if not worst <= bars.evaluation:
         raise ExportError(
-            f"The graphs are off by {worst:.2g} of their largest value; {EVALUATION_BAR:g} is allowed."
+            f"The graphs are off by {worst:.2g} of their largest value; {bars.evaluation:g} is allowed."
         )
     return worst
 
 
 def check_sampling(
-    network: torch.nn.Module, graphs: mini.Graphs, grid: GridRule, sigmas: Array, guidance: float
+    network: torch.nn.Module,
+    graphs: mini.Graphs,
+    grid: GridRule,
+    sigmas: Array,
+    guidance: float,
+    bars: Bars,
 ) -> float:
     """The lowest PSNR, in dB, between whole runs of the runtime's sampler over the graph and over torch."""
     lowest = math.inf
@@ -55,9 +66,9 @@ def check_sampling(
         error = _run(graphs.guided(condition, guidance), condition, sigmas) - _run(torch_s, condition, sigmas)
         mean_square = float(np.mean(np.square(error / SPAN[mode], dtype=np.float64)))
         lowest = min(lowest, -10 * math.log10(max(mean_square, 1e-20)))
-    if not lowest >= SAMPLING_BAR:
+    if not lowest >= bars.sampling:
         raise ExportError(
-            f"After all steps the graphs keep {lowest:.1f} dB to torch; they need {SAMPLING_BAR:g}."
+            f"After all steps the graphs keep {lowest:.1f} dB to torch; they need {bars.sampling:g}."
         )
     return lowest
 

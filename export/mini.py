@@ -20,12 +20,14 @@ import onnx_ir
 import torch
 from onnx import TensorProto, helper, numpy_helper
 from onnx_ir.passes.common import ClearMetadataAndDocStringPass
+from onnxruntime.quantization import QuantType, quantize_dynamic
 from torch.export import Dim
 
 from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
 from dior_rt.engine import Engine, Feeds
 from dior_rt.errors import InputError
 from dior_rt.export.check import (
+    Bars,
     ExportError,
     check_evaluations,
     check_sampling,
@@ -42,8 +44,10 @@ from dior_rt.sampler import Array
 from dior_rt.schedule import ShiftSchedule
 from dior_rt.training.network import LORA, WEIGHTS, Features, Mini, load_network
 
-Weights = Literal["fp16", "fp32"]
+Weights = Literal["fp16", "fp32", "int8"]
 
+EXACT: Final = Bars(evaluation=1e-4, sampling=60.0)
+BARS: Final[dict[Weights, Bars]] = {"fp32": EXACT, "fp16": EXACT, "int8": Bars(evaluation=0.2, sampling=40.0)}
 LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothing
 
 
@@ -91,14 +95,15 @@ def export_network(
 ) -> Bundle:
     """Write a network's bundle at `out`.
 
-    weights: how they are stored; for fp16 the network's own are rounded in place. The graphs compute
-    in float32 either way. Raises InputError for a recipe that cannot be, ExportError where they compute
-    something else than torch with the same weights, and BundleError where nothing can be written.
+    weights: how they are stored; but for fp32 the network's own are rounded to float16 in place. The graphs
+    compute in float32, but for int8 with the matrix products in integers. Raises InputError for a recipe that
+    cannot be, ExportError where they compute something else than torch with the same weights, beyond
+    `BARS`, and BundleError where nothing can be written.
     """
     check_target(out, overwrite)
     manifest, grid = describe(recipe, weights), recipe.grid
     network = network.eval()
-    parity = {"weights_as_fp16": round_to_half(network, grid)} if weights == "fp16" else {}
+    parity = {} if weights == "fp32" else {"weights_as_fp16": round_to_half(network, grid)}
     with tempfile.TemporaryDirectory() as scratch:
         parts: dict[str, Encode | Step] = {"encode": Encode(network), "velocity": Step(network)}
         files: dict[str, Path] = {}
@@ -106,9 +111,9 @@ def export_network(
             files |= write_graph(part, name, Path(scratch), grid.multiple, weights)
         engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
         found = mini.Graphs(**engines)
-        parity["evaluation"] = check_evaluations(network, found, grid)
-        sigmas = recipe.schedule.sigmas(recipe.steps)
-        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, recipe.guidance)
+        bars, sigmas = BARS[weights], recipe.schedule.sigmas(recipe.steps)
+        parity["evaluation"] = check_evaluations(network, found, grid, bars)
+        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, recipe.guidance, bars)
         graphs = {
             name: Graph(f"{name}.onnx", engine.inputs, engine.outputs, f"{name}.npz")
             for name, engine in engines.items()
@@ -171,13 +176,19 @@ class Step(torch.nn.Module):
 def write_graph(
     part: Encode | Step, name: str, folder: Path, multiple: int, weights: Weights
 ) -> dict[str, Path]:
-    """Write one graph and its probe, a small evaluation and what torch answers; returns the two files."""
+    """Write one graph and its probe, a small evaluation and the right answers; returns the two files.
+
+    These are torch's; of int8 the CPU's, since a device has to be held to more than int8 keeps of torch's.
+    """
     graph, probe = folder / f"{name}.onnx", folder / f"{name}.npz"
     convert(part, graph, multiple)
-    if weights == "fp16":
+    if weights == "int8":
+        multiply_in_int8(graph)
+    if weights != "fp32":
         store_as_half(graph)
     feeds = part.feeds(2 * multiple, 3 * multiple, seed=1)
-    arrays: dict[str, Any] = {**feeds, **answers(part, feeds)}
+    right = Engine(graph).run(feeds) if weights == "int8" else answers(part, feeds)
+    arrays: dict[str, Any] = {**feeds, **right}
     np.savez(probe, **arrays)
     return {graph.name: graph, probe.name: probe}
 
@@ -242,6 +253,23 @@ def round_to_half(network: torch.nn.Module, grid: GridRule) -> float:
         if weight.numel() >= LARGE:
             weight.data = weight.data.half().float()
     return relative_error(evaluate(network, feeds), before)
+
+
+def multiply_in_int8(path: Path) -> None:
+    """Have a graph's matrix products take weights of 7 bits, a scale for each output, and activations of 8
+    bits, a scale for each call. With an 8th bit of weights, CPUs without VNNI would overflow in silence."""
+    logging.disable(logging.WARNING)  # advice to preprocess, which `convert` has done
+    try:
+        quantize_dynamic(
+            path,
+            path,
+            op_types_to_quantize=["MatMul", "Gemm"],
+            weight_type=QuantType.QInt8,
+            per_channel=True,
+            reduce_range=True,
+        )
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def store_as_half(path: Path) -> None:

@@ -107,7 +107,7 @@ def export(
             )
     else:
         files = transformer or vae or text_encoder
-        if few_steps or free_steps or prompt_cache or files or weights in ("int8", "int4"):
+        if few_steps or free_steps or prompt_cache or files or weights == "int4":
             raise InputError(f"{source} is no Qwen-Image-Edit, and these options are for that.")
         if len(lora) > 1:
             raise InputError("A checkpoint of training takes one LoRA.")
@@ -125,7 +125,7 @@ def export(
                     guidance=1.0 if guidance is None else guidance,
                     noise_scale=1.0 if noise_scale is None else noise_scale,
                 ),
-                weights="fp32" if weights == "fp32" else "fp16",
+                weights=weights,
                 overwrite=overwrite,
             )
     table([(f"parity {name}", f"{value:.4g}") for name, value in bundle.manifest.parity.items()])

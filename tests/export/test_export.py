@@ -28,6 +28,7 @@ from dior_rt.export.check import (
     run,
 )
 from dior_rt.export.mini import (
+    EXACT,
     Encode,
     Step,
     answers,
@@ -169,6 +170,17 @@ def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
     assert relative_error(run(open_graphs(bundle), feeds), evaluate(adapted.eval(), feeds)) < 1e-5
 
 
+def test_int8_multiplies_in_integers_and_stays_near(network, recipe, tmp_path):
+    """Its self-test holds devices to the CPU's answers; its parity says how far those are from torch's."""
+    bundle = export_network(network, recipe, tmp_path / "b", weights="int8")
+    assert bundle.manifest.precision == "int8"
+    assert 1e-5 < bundle.manifest.parity["evaluation"] < 0.2
+    operators = {node.op_type for node in onnx.load(bundle.path("velocity")).graph.node}
+    assert "MatMulInteger" in operators and "MatMul" in operators  # attention stays float32
+    feeds = random_feeds(8, 12, seed=3)
+    assert 1e-6 < relative_error(run(open_graphs(bundle), feeds), evaluate(network, feeds)) < 0.2
+
+
 def test_the_command_says_how_the_bundle_runs(network, tmp_path, capfd):
     save_network(network, tmp_path / "model.safetensors")
     made = ["export", str(tmp_path), "--steps", "2", "-o", str(tmp_path / "b"), "--shift"]
@@ -193,16 +205,16 @@ def spoiled(network, by):
 
 def test_a_graph_that_differs_fails_in_one_evaluation(exported, rounded, recipe):
     graphs = open_graphs(exported)
-    assert check_evaluations(rounded, graphs, recipe.grid) < 1e-5
+    assert check_evaluations(rounded, graphs, recipe.grid, EXACT) < 1e-5
     with pytest.raises(ExportError, match="off by"):
-        check_evaluations(spoiled(rounded, by=0.01), graphs, recipe.grid)
+        check_evaluations(spoiled(rounded, by=0.01), graphs, recipe.grid, EXACT)
 
 
 def test_a_graph_that_differs_fails_after_all_steps(exported, rounded, recipe):
     graphs, sigmas = open_graphs(exported), ShiftSchedule(8.0).sigmas(4)
-    assert check_sampling(rounded, graphs, recipe.grid, sigmas, 2.0) > 100
+    assert check_sampling(rounded, graphs, recipe.grid, sigmas, 2.0, EXACT) > 100
     with pytest.raises(ExportError, match="dB"):
-        check_sampling(spoiled(rounded, by=0.2), graphs, recipe.grid, sigmas, 2.0)
+        check_sampling(spoiled(rounded, by=0.2), graphs, recipe.grid, sigmas, 2.0, EXACT)
 
 
 def test_an_export_over_the_bar_leaves_nothing_behind(exported, network, recipe, tmp_path, monkeypatch):

@@ -170,11 +170,36 @@ def test_what_is_drawn_is_spread_as_it_is_and_no_farther_than_said() -> None:
     drawn = torch.zeros(1, 4, 64, 64)
     drawn[..., 20:24, 20:24] = torch.tensor([2.0, -1.0, 0.0, 1.0])[:, None, None]
     near, everywhere = module.spread(drawn, 8), module.spread_everywhere(drawn)
-    assert near[..., 48:].abs().max() == 0 and everywhere.std(dim=(2, 3)).max() == 0
+    assert near[..., 52:].abs().max() < 0.02 and everywhere.std(dim=(2, 3)).max() == 0
     for *means, share in (near[0, :, 22, 22], everywhere[0, :, 0, 0]):
         assert 0.2 < share <= 1
         torch.testing.assert_close(torch.stack(means) / share, torch.tensor([2.0, -1.0, 0.0]))
     assert module.spread(0 * drawn, 8).abs().max() == 0
+
+
+def test_what_is_drawn_is_spread_in_rounds_and_not_in_boxes() -> None:
+    cells = torch.zeros(1, 1, 65, 65, dtype=torch.float64)
+    cells[..., 32, 32] = 1
+    mean = module.around(cells, 6)[0, 0]
+    rows, columns = torch.meshgrid(torch.arange(65) - 32.0, torch.arange(65) - 32.0, indexing="ij")
+    expected = torch.exp(-(rows**2 + columns**2) / 72).double() / (72 * torch.pi)
+    torch.testing.assert_close(mean, expected, atol=1e-6, rtol=0)
+    flat = module.around(torch.ones(1, 1, 5, 90), 6)
+    torch.testing.assert_close(flat, torch.ones_like(flat))
+
+
+@torch.no_grad()
+def test_light_drawn_ends_softly_beside_a_stroke() -> None:
+    given = inputs(64, 64, 1, noise=True)
+    given["photo"], given["light"] = 0.3 + 0 * given["photo"], 0.3 + 0 * given["light"]
+    given["mask"] = 0 * given["mask"]
+    given["mask"][..., 20:44, 30:34] = 1
+    relit = given["photo"] + found(Mini(SMALL), given) / 4
+    row = torch.log(srgb_to_linear(relit[0, 0, 32]) + module.FLOOR)
+    row = (row - row[0]) / (row[31] - row[0])
+    assert (row[30:34] - 1).abs().max() < 1e-3, "under the stroke it is what was drawn"
+    falls = -row[33:].diff()
+    assert 0 < falls[0] < 0.3 and falls.max() < 0.3 and falls.min() > -1e-4
 
 
 def test_colour_is_the_kernels_colour() -> None:
