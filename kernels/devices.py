@@ -121,15 +121,17 @@ def _choose_best() -> Ops:
         problems = [] if devices else ["no OpenCL platform has a device"]
     except KernelError as error:
         devices, problems = [], [str(error)]
+    ops: Ops = NumpyOps()
     for device in devices:
         try:
-            ops = open_device(device, spare=NumpyOps())
+            tested = open_device(device, spare=ops)
         except KernelError as error:
             problems.append(str(error))
             continue
-        ops.reason = "; ".join([*problems, f"it is the first OpenCL {device.type} that passes its self-test"])
-        return ops
-    ops = NumpyOps()
+        tested.reason = "; ".join(
+            [*problems, f"it is the first OpenCL {device.type} that passes its self-test"]
+        )
+        return tested
     ops.reason = "; ".join([*problems, "so the pixel kernels run on NumPy"])
     return ops
 

@@ -14,14 +14,15 @@ from dior_rt.kernels.types import KernelError, Stroke, Strokes
 
 #: Of the pictures: odd, and so wide that a cell of the grid holds more pixels than any device has lanes.
 SIZE, GRID = (37, 149), (5, 7)
-FLOAT = np.dtype(np.float32)
+FLOAT: np.dtype = np.dtype(np.float32)
 
 Case = tuple[str, Callable[[Ops], np.ndarray | Strokes], float]
 
 
 def self_test(ops: Ops, dtypes: tuple[npt.DTypeLike, ...] = (np.uint8,)) -> None:
     """Try every operation, on small pictures of each dtype. Raises KernelError that says what is wrong."""
-    for dtype in map(np.dtype, dtypes):
+    for kind in dtypes:
+        dtype: np.dtype = np.dtype(kind)
         for op in ("decode", "encode", "reduce_photo", "transfer"):
             try_op(ops, op, dtype)
     try_op(ops, "reduce_strokes", FLOAT, FLOAT)
@@ -53,37 +54,39 @@ def _cases(op: str, *dtypes: np.dtype) -> Iterator[Case]:
     rng = np.random.default_rng(20)
     light = rng.random((*SIZE, 3), np.float32)
     mask = np.where(rng.random(SIZE) < 0.3, rng.random(SIZE, np.float32), 0)
-    encode = NumpyOps().encode_srgb
-    match op, *dtypes:
-        case "decode", dtype:
-            yield f"decode_srgb of {dtype}", partial(Ops.decode_srgb, picture=encode(light, dtype)), 2e-6
-        case "encode", dtype:
-            exact = 2e-6 if dtype == FLOAT else 0
-            yield f"encode_srgb to {dtype}", partial(Ops.encode_srgb, linear=light, dtype=dtype), exact
-        case "reduce_photo", dtype:
-            picture = encode(light, dtype)
-            yield f"reduce_photo of {dtype}", partial(Ops.reduce_photo, picture=picture, grid=GRID), 1e-5
-        case "transfer", dtype:
-            step = {"uint8": 1, "uint16": 3}.get(dtype.name, 1e-5)
-            for columns in (60, 2):  # cells of two pixels, and wide ones
-                source, relit = rng.random((2, GRID[0], columns, 3), np.float32)
-                relight = partial(Ops.transfer, photo=encode(light, dtype), source=source, relit=relit)
-                yield f"transfer of {dtype} from {columns} columns", relight, step
-        case "reduce_strokes", of_light, of_mask:
-            drawn = light if of_light == FLOAT else encode(light, of_light)
-            share = mask if of_mask == FLOAT else np.round(mask * np.iinfo(of_mask).max).astype(of_mask)
-            reduce = partial(Ops.reduce_strokes, light=drawn, mask=share, grid=GRID)
-            yield f"reduce_strokes of {of_light}, mask {of_mask}", reduce, 1e-5
-        case ("draw_strokes",):
-            strokes = [
-                Stroke(((3.0, 4.0), (40.0, 20.0), (10.0, 33.0)), 6.0, (1.0, 0.5, 0.2), 2.0, 0.5),
-                Stroke(((50.0, 30.0),), 0.3, (0.0, 1.0, 4.0)),
-            ]
-            yield "draw_strokes", partial(Ops.draw_strokes, strokes=strokes, size=SIZE), 1e-4
-        case ("cut",):
-            yield "sparsify to strokes", partial(Ops.sparsify, lumi=light, mode="strokes", seed=1), 0
-        case ("coarsen",):
-            yield "sparsify to coarse cells", partial(Ops.sparsify, lumi=light, mode="coarse", seed=1), 1e-5
+    dtype = dtypes[0] if dtypes else FLOAT
+    picture = NumpyOps().encode_srgb(light, dtype)
+    if op == "decode":
+        yield f"decode_srgb of {dtype}", partial(Ops.decode_srgb, picture=picture), 2e-6
+    elif op == "encode":
+        exact = 2e-6 if dtype == FLOAT else 0
+        yield f"encode_srgb to {dtype}", partial(Ops.encode_srgb, linear=light, dtype=dtype), exact
+    elif op == "reduce_photo":
+        yield f"reduce_photo of {dtype}", partial(Ops.reduce_photo, picture=picture, grid=GRID), 1e-5
+    elif op == "transfer":
+        step = {"uint8": 1, "uint16": 3}.get(dtype.name, 1e-5)
+        for columns in (60, 2):  # cells of two pixels, and wide ones
+            source, relit = rng.random((2, GRID[0], columns, 3), np.float32)
+            relight = partial(Ops.transfer, photo=picture, source=source, relit=relit)
+            yield f"transfer of {dtype} from {columns} columns", relight, step
+    elif op == "reduce_strokes":
+        drawn, share = light if dtype == FLOAT else picture, _of_dtype(mask, dtypes[1])
+        reduce = partial(Ops.reduce_strokes, light=drawn, mask=share, grid=GRID)
+        yield f"reduce_strokes of {dtype}, mask {dtypes[1]}", reduce, 1e-5
+    elif op == "draw_strokes":
+        strokes = [
+            Stroke(((3.0, 4.0), (40.0, 20.0), (10.0, 33.0)), 6.0, (1.0, 0.5, 0.2), 2.0, 0.5),
+            Stroke(((50.0, 30.0),), 0.3, (0.0, 1.0, 4.0)),
+        ]
+        yield "draw_strokes", partial(Ops.draw_strokes, strokes=strokes, size=SIZE), 1e-4
+    elif op == "cut":
+        yield "sparsify to strokes", partial(Ops.sparsify, lumi=light, mode="strokes", seed=1), 0
+    else:
+        yield "sparsify to coarse cells", partial(Ops.sparsify, lumi=light, mode="coarse", seed=1), 1e-5
+
+
+def _of_dtype(mask: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    return mask if dtype == FLOAT else np.round(mask * np.iinfo(dtype).max).astype(dtype)
 
 
 def _arrays(result: np.ndarray | Strokes) -> list[np.ndarray]:
