@@ -56,7 +56,9 @@ STAGES = ("read", "kernels", "steps", "transfer", "write")
 
 
 def work(job: Job) -> Sample:
-    """Relight every pair once to warm up, with a single step, and once for the clock."""
+    """Relight every pair once to warm up, with a single step, and once for the clock.
+
+    The warm-up is of the photo's mirror image, as the model remembers what it saw of its last photo."""
     import numpy as np
 
     from dior_rt.relight import Relighter
@@ -75,7 +77,8 @@ def work(job: Job) -> Sample:
         photo = read_photo(Path(pair.photo))
         strokes = read_strokes(Path(pair.strokes), photo.size)
         watch.lap("read")
-        relighter.relight(photo.pixels, strokes, steps=1, guidance=setting.guidance, progress=first_step)
+        mirrored = np.ascontiguousarray(photo.pixels[:, ::-1])
+        relighter.relight(mirrored, strokes, steps=1, guidance=setting.guidance, progress=first_step)
         relit = relighter.relight(photo.pixels, strokes, **setting.how())
         taken += relit.steps
         if relit.notice:

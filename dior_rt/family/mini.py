@@ -6,7 +6,7 @@ and photo are sRGB-encoded and encode(L) = log(1 + 8 L) / log 9: in both, square
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -80,12 +80,15 @@ def null(condition: Condition) -> Condition:
     return {**condition, **{name: np.zeros_like(condition[name]) for name in ("light", "mask")}}
 
 
-@dataclass(frozen=True)
 class Graphs:
-    """Mini's two graphs. encode: what photo and strokes say, run once; velocity: run at every step."""
+    """Mini's two graphs. encode: what photo and strokes say, run once; velocity: run at every step.
 
-    encode: Engine
-    velocity: Engine
+    What the photo alone says is remembered until another comes: who paints draws on one photo many times.
+    """
+
+    def __init__(self, encode: Engine, velocity: Engine) -> None:
+        self.encode, self.velocity = encode, velocity
+        self._blank, self._own_light = lru_cache(1)(self._look), lru_cache(1)(self._estimate)
 
     def guided(self, condition: Condition, guidance: float) -> Velocity:
         """The velocity under a condition, and guided away from none: see `dior_rt.sampler.guided`."""
@@ -102,27 +105,29 @@ class Graphs:
         return velocity
 
     def branches(self, condition: Condition) -> tuple[Condition, Condition]:
-        """What a step is told of photo and strokes, and of the photo alone.
-
-        What is drawn is measured against the photo's own light, so where anything is, that is estimated
-        first: an evaluation without strokes from a silent state.
-        """
+        """What a step is told of photo and strokes, and of the photo alone."""
         mode, seen = {"mode": condition["mode"]}, {name: condition[name] for name in SEEN}
-        blank = self.encode.run({**null(seen), "own": np.zeros_like(seen["photo"])})
-        if not seen["mask"].any():
-            return {**mode, **blank}, {**mode, **blank}
-        drawn = self.encode.run({**seen, "own": self._own_light(blank)})
+        photo = seen["photo"].shape, seen["photo"].tobytes()
+        blank = drawn = self._blank(*photo)
+        if seen["mask"].any():
+            drawn = self.encode.run({**seen, "own": self._own_light(*photo)})
         return {**mode, **drawn}, {**mode, **blank}
 
-    def _own_light(self, blank: Condition) -> Array:
-        """The light on a photo, encoded, from the features of it alone."""
-        count, _, height, width = blank["given"].shape
+    def _look(self, shape: tuple[int, ...], photo: bytes) -> Condition:
+        """What the graph "encode" says of a photo alone."""
+        pixels = np.frombuffer(photo, np.float32).reshape(shape)
+        seen = {"photo": pixels, "light": np.zeros_like(pixels), "mask": np.zeros_like(pixels[:, :1])}
+        return self.encode.run({**seen, "own": np.zeros_like(pixels)})
+
+    def _estimate(self, shape: tuple[int, ...], photo: bytes) -> Array:
+        """The light on a photo, encoded, which what is drawn is measured against: an evaluation without
+        strokes from a silent state."""
         asked: Condition = {
-            "x": np.zeros((count, 3, height, width), np.float32),
-            "sigma": np.ones(count, np.float32),
-            "mode": np.full(count, MODES["estimate"], np.int64),
+            "x": np.zeros(shape, np.float32),
+            "sigma": np.ones(shape[0], np.float32),
+            "mode": np.full(shape[0], MODES["estimate"], np.int64),
         }
-        velocity: Array = self.velocity.run({**asked, **blank})["velocity"]
+        velocity: Array = self.velocity.run({**asked, **self._blank(shape, photo)})["velocity"]
         # From x = 0 at sigma = 1 it is -x0, and x0 is 2 own - 1.
         return (np.float32(1) - velocity) / np.float32(2)
 

@@ -7,7 +7,7 @@ import pytest
 
 from dior_rt.bundle import read_bundle
 from dior_rt.errors import BundleError
-from dior_rt.family.mini import Mini, encode, null
+from dior_rt.family.mini import Graphs, Mini, encode, null
 from dior_rt.kernels import Strokes
 from dior_rt.sampler import draw_noise
 from dior_rt.schedule import DynamicShiftSchedule
@@ -82,6 +82,40 @@ def test_velocity_is_guided_between_the_two_branches(mini, photo, strokes):
     v_null, v_cond, v = (mini.velocity(condition, sigmas, scale)(x, 0.7) for scale in (0.0, 1.0, 3.0))
     assert np.abs(v_cond - v_null).max() > 1e-3
     np.testing.assert_allclose(v, v_null + 3 * (v_cond - v_null), rtol=1e-4, atol=1e-4)
+
+
+class Counted:
+    """An engine that counts its runs."""
+
+    def __init__(self, engine):
+        self.engine, self.runs = engine, 0
+
+    def run(self, feeds):
+        self.runs += 1
+        return self.engine.run(feeds)
+
+    def bind(self, constants):
+        return self.engine.bind(constants)
+
+
+def test_what_a_photo_says_is_asked_once_while_someone_paints_on_it(mini, photo, strokes):
+    graphs = Graphs(Counted(mini._graphs.encode), Counted(mini._graphs.velocity))
+    other, more = photo[:, ::-1], Strokes(2 * strokes.light, strokes.mask)
+    conditions = [encode(*each, "relight") for each in ((photo, strokes), (photo, more), (other, more))]
+    found = [graphs.branches(condition) for condition in (*conditions, conditions[0])]
+    # The photo alone and its light, for each of three changes of photo; and the strokes, each time.
+    assert (graphs.encode.runs, graphs.velocity.runs) == (3 + 4, 3)
+    for condition, branches in zip((*conditions, conditions[0]), found, strict=True):
+        afresh = Graphs(mini._graphs.encode, mini._graphs.velocity).branches(condition)
+        for branch, expected in zip(branches, afresh, strict=True):
+            for name, array in expected.items():
+                np.testing.assert_array_equal(branch[name], array)
+
+
+def test_an_estimate_asks_for_no_light_beforehand(mini, photo):
+    graphs = Graphs(Counted(mini._graphs.encode), Counted(mini._graphs.velocity))
+    drawn, blank = graphs.branches(encode(photo, None, "estimate"))
+    assert drawn.keys() == blank.keys() and (graphs.encode.runs, graphs.velocity.runs) == (1, 0)
 
 
 def test_the_graph_sees_strokes_and_mode(mini, photo, strokes):
