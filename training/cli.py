@@ -62,7 +62,8 @@ def fit(
     heads: Annotated[int, typer.Option(min=1)] = 8,
     precision: Precision = "no",
     compiled: Annotated[bool, typer.Option("--compile", help="Minutes at first, then faster steps.")] = False,
-    edges: Annotated[float, typer.Option(min=0, help="Of the loss on differences between neighbours.")] = 0.5,
+    drawn: Annotated[float, typer.Option(min=0, help="How much more errors count under strokes.")] = 4.0,
+    edges: Annotated[float, typer.Option(min=0, help="Of the loss on differences between cells.")] = 0.15,
     start: Annotated[
         Path | None, typer.Option(metavar="FILE", help="model.safetensors to go on from, with its sizes.")
     ] = None,
@@ -73,7 +74,9 @@ def fit(
     from dior_rt.training.fit import fit as run
     from dior_rt.training.network import Config
 
-    plan = Plan(steps, batch, rate, edges=edges, seed=seed, precision=precision, compiled=compiled)
+    plan = Plan(
+        steps, batch, rate, drawn=drawn, edges=edges, seed=seed, precision=precision, compiled=compiled
+    )
     with _Bar(steps) as bar:
         run(renders, out, start or Config(width, depth, heads), plan, bar.show)
 

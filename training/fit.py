@@ -44,6 +44,7 @@ class Plan:
     clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. silent: the
     share of samples whose noise is 0, as it is where sampling starts from the noise's mean. noise: how
     strong it is in the others. own: how the error of the photo's own light counts beside that of x0.
+    drawn: how much more an error counts where something is drawn: there the light is known, and looked at.
     edges: how the error's differences between neighbouring cells count beside the error: the outline of a
     stroke that shows where the light goes on is small in error and large to the eye.
     precision: as accelerate names it. compiled: by torch.compile, which takes minutes and then nearly
@@ -63,6 +64,7 @@ class Plan:
     silent: float = 0.7
     noise: float = 1.0
     own: float = 0.25
+    drawn: float = 0.0
     edges: float = 0.0
     seed: int = 0
     precision: Literal["no", "bf16"] = "no"
@@ -110,13 +112,20 @@ def rendered(renders: Path, plan: Plan) -> Stream:
 
 
 def flow_loss(
-    network: nn.Module, batch: Batch, sigma: Tensor, noise: Tensor, own: float = 0.0, edges: float = 0.0
+    network: nn.Module,
+    batch: Batch,
+    sigma: Tensor,
+    noise: Tensor,
+    own: float = 0.0,
+    drawn: float = 0.0,
+    edges: float = 0.0,
 ) -> Tensor:
     """Mean squared error of x0 at flow times sigma (B,); the network sees (1 - sigma) x0 + sigma noise.
 
     A batch may carry `weight` (B,), by which each sample's error counts, and `own`, the light on the photo as
     estimation's x0 has it; the error of the network's idea of it counts `own` times as much as that of x0.
-    The differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count `edges` times.
+    Where the mask is, squared errors count `drawn` times more; a sample's weights are 1 in the mean. The
+    differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count `edges` times.
     """
     s = sigma[:, None, None, None]
     x0 = batch["x0"]
@@ -127,6 +136,9 @@ def flow_loss(
     velocity, light = answer if asked else (answer, None)
     error = x - s * velocity - x0
     errors = _mean_square(error)  # (B,)
+    if drawn:
+        weight = 1 + drawn * batch["mask"]
+        errors = (weight * error.square()).flatten(1).mean(dim=1) / weight.flatten(1).mean(dim=1)
     if edges:
         errors = errors + edges * (_mean_square(error.diff(dim=2)) + _mean_square(error.diff(dim=3)))
     if light is not None:
@@ -212,7 +224,7 @@ def _step(accelerator: Accelerator, network: nn.Module, state: State, batch: Bat
     noise = torch.randn(batch["x0"].shape, generator=generator).to(accelerator.device)
     noise *= draw_loud(len(noise), plan, generator).to(accelerator.device)
     with accelerator.autocast():
-        loss = flow_loss(network, batch, sigma, noise, plan.own, plan.edges)
+        loss = flow_loss(network, batch, sigma, noise, plan.own, plan.drawn, plan.edges)
     accelerator.backward(loss)
     accelerator.clip_grad_norm_(state.weights, plan.clip)
     state.optimizer.step()

@@ -38,8 +38,8 @@ Grids = tuple[tuple[int, int], ...]  # (rows, columns) in cells
 GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
 CHANGES = ("change", "local", "dab")  # of one light, of one place, and of the place of a lone dab
 KINDS = (*CHANGES, "replace", "keep")
-KIND_SHARES = (0.17, 0.25, 0.22, 0.28, 0.08)
-GELS = {"local": 0.6, "dab": 1.0}  # the share of changes that are of all lights alike
+KIND_SHARES = (0.14, 0.22, 0.32, 0.25, 0.07)
+GELS = ("local", "dab")  # changes of all lights alike, by any factor
 STOPS = 4.0  # by which these change, at most
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
 DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
@@ -151,8 +151,7 @@ def pair(
     lights = random_lights(rng, usable)
     relights = lights
     if kind in CHANGES:
-        alike = kind in GELS and rng.uniform() < GELS[kind]
-        relights = lights * gel(rng) if alike else change_one(rng, lights, usable)
+        relights = lights * gel(rng) if kind in GELS else change_one(rng, lights, usable)
     elif kind == "replace":
         relights = random_lights(rng, usable)
     photo, source = mix(view, lights * balance)
@@ -207,23 +206,19 @@ def interest(sample: Pair) -> Raster:
 
 def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     """Light (h, w, 3) and mask (h, w) that a person might have drawn for the pair, at grid size."""
-    seed = int(rng.integers(2**31))
     if sample.kind == "dab":
         mask = dab(rng, interest(sample))
         return flat(sample.target, mask), mask
-    if sample.kind in CHANGES and rng.uniform() < 0.85:
-        drawn = ops.sparsify(sample.target, "strokes", seed, interest=interest(sample))
-        if rng.uniform() < 0.5:
-            return flat(sample.target, drawn.mask), drawn.mask
-    else:
-        modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
-        mode = modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
-        drawn = ops.sparsify(sample.target, mode, seed)
-        if mode == "strokes" and sample.kind == "replace":
-            # Who lights a whole picture anew draws more than once; a lone stroke means its own place.
-            more = ops.sparsify(sample.target, mode, int(rng.integers(2**31)))
-            return np.maximum(drawn.light, more.light), np.maximum(drawn.mask, more.mask)
-    return drawn.light, drawn.mask
+    aimed = sample.kind in CHANGES and rng.uniform() < 0.85
+    modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
+    mode = "strokes" if aimed else modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
+    where = interest(sample) if aimed else None
+    # Who changes a light or all of them draws more than once; a lone stroke means its own place.
+    times = 2 if mode == "strokes" and sample.kind in ("change", "replace") else 1
+    drawn = [ops.sparsify(sample.target, mode, int(rng.integers(2**31)), where) for _ in range(times)]
+    light = np.max([strokes.light for strokes in drawn], axis=0)
+    mask = np.max([strokes.mask for strokes in drawn], axis=0)
+    return (flat(sample.target, mask) if aimed and rng.uniform() < 0.5 else light), mask
 
 
 def dab(rng: Generator, interest: Raster) -> Raster:

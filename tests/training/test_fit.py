@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from dior_rt.errors import InputError
 from dior_rt.export.lora import merge_lora
 from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss
-from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network
+from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.triplets import Batches
 
 TINY = Config(width=32, depth=1, heads=2, patch=8, fine=4, half=8, quarter=16)
@@ -152,3 +152,53 @@ def test_compiled_training_is_training(renders, tmp_path) -> None:
     plain, compiled = (load_file(tmp_path / name / WEIGHTS) for name in ("plain", "compiled"))
     for key, weight in plain.items():
         torch.testing.assert_close(compiled[key], weight, rtol=1e-3, atol=1e-5)
+
+
+def off_by(error: torch.Tensor) -> torch.nn.Module:
+    """A network whose answer is wrong by `error`, at sigma = 1 and without noise."""
+
+    class Off(torch.nn.Module):
+        def forward(self, x, sigma, photo, light, mask, mode):
+            return -(error + 0 * photo)
+
+    return Off()
+
+
+@pytest.mark.parametrize("weight", [1.0, 4.0])
+def test_an_error_under_strokes_counts_more_and_the_weights_are_1_in_the_mean(weight):
+    mask = torch.zeros(1, 1, 8, 8)
+    mask[..., :2, :] = 1  # a quarter of the cells
+    blank = torch.zeros(1, 3, 8, 8)
+    batch = {"photo": blank, "light": blank, "mask": mask, "mode": torch.zeros(1, dtype=torch.int64)}
+    batch["x0"] = blank
+
+    def loss(error):
+        return float(flow_loss(off_by(error), batch, torch.ones(1), blank, drawn=weight))
+
+    assert loss(torch.ones(1, 3, 8, 8)) == pytest.approx(1)
+    assert loss(mask) / loss(1 - mask) == pytest.approx((1 + weight) / 3)
+
+
+def test_errors_that_change_from_cell_to_cell_count_more_than_even_ones():
+    blank = torch.zeros(1, 3, 8, 8)
+    batch = {"photo": blank, "light": blank, "mask": blank[:, :1], "mode": torch.zeros(1, dtype=torch.int64)}
+    batch["x0"] = blank
+    rows, columns = torch.meshgrid(torch.arange(8), torch.arange(8), indexing="ij")
+    checks = (1.0 - 2 * ((rows + columns) % 2)).expand(1, 3, 8, 8)
+
+    def loss(error):
+        return float(flow_loss(off_by(error), batch, torch.ones(1), blank, edges=0.5))
+
+    assert loss(torch.ones(1, 3, 8, 8)) == pytest.approx(1)
+    assert loss(checks) == pytest.approx(1 + 0.5 * (4 + 4))
+
+
+def test_training_goes_on_from_weights_with_their_sizes(tmp_path, renders):
+    config = Config(width=16, depth=1, heads=1, patch=4, fine=4, half=8, quarter=8)
+    save_network(Mini(config), tmp_path / "start.safetensors")
+    plan = Plan(1, batch=2, rate=0.0, grids=((16, 16),))
+    fit(renders, tmp_path / "out", tmp_path / "start.safetensors", plan)
+    start, end = (load_network(tmp_path / name) for name in ("start.safetensors", "out/model.safetensors"))
+    assert end.config == config
+    for (name, weight), other in zip(start.named_parameters(), end.parameters(), strict=True):
+        torch.testing.assert_close(other, weight, atol=1e-6, rtol=0, msg=name)
