@@ -64,6 +64,9 @@ def fit(
     compiled: Annotated[bool, typer.Option("--compile", help="Minutes at first, then faster steps.")] = False,
     drawn: Annotated[float, typer.Option(min=0, help="How much more errors count under strokes.")] = 4.0,
     edges: Annotated[float, typer.Option(min=0, help="Of the loss on differences between cells.")] = 0.15,
+    response: Annotated[
+        float, typer.Option(min=0, help="Of the loss on twice the value being twice the light.")
+    ] = 1.0,
     start: Annotated[
         Path | None, typer.Option(metavar="FILE", help="model.safetensors to go on from, with its sizes.")
     ] = None,
@@ -75,7 +78,15 @@ def fit(
     from dior_rt.training.network import Config
 
     plan = Plan(
-        steps, batch, rate, drawn=drawn, edges=edges, seed=seed, precision=precision, compiled=compiled
+        steps,
+        batch,
+        rate,
+        drawn=drawn,
+        edges=edges,
+        response=response,
+        seed=seed,
+        precision=precision,
+        compiled=compiled,
     )
     with _Bar(steps) as bar:
         run(renders, out, start or Config(width, depth, heads), plan, bar.show)

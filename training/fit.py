@@ -23,10 +23,21 @@ from torch.utils.data import DataLoader, IterableDataset
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder
 from dior_rt.training.backbone import MiniLora
-from dior_rt.training.network import WEIGHTS, Config, Mini, load_network, save_network
+from dior_rt.training.network import (
+    BOUNCED,
+    FLOOR,
+    RELIT_SCALE,
+    WEIGHTS,
+    Config,
+    Mini,
+    load_network,
+    save_network,
+    srgb_to_linear,
+)
 from dior_rt.training.state import Average, State
 from dior_rt.training.triplets import GRIDS, Batches, Grids, load_views
 
+STOPS: Final = 2.0  # by which drawn light is strengthened or dimmed to see what it does
 STATE: Final = "state.safetensors"  # what a run resumes from
 
 Progress = Callable[[int, float], None]  # step, running loss
@@ -47,6 +58,7 @@ class Plan:
     drawn: how much more an error counts where something is drawn: there the light is known, and looked at.
     edges: how the error's differences between neighbouring cells count beside the error: the outline of a
     stroke that shows where the light goes on is small in error and large to the eye.
+    response: the weight of `response_loss`, taken of half of a batch.
     precision: as accelerate names it. compiled: by torch.compile, which takes minutes and then nearly
     halves a step's time on CPUs. grids: see `Batches`.
     """
@@ -66,6 +78,7 @@ class Plan:
     own: float = 0.25
     drawn: float = 0.0
     edges: float = 0.0
+    response: float = 0.0
     seed: int = 0
     precision: Literal["no", "bf16"] = "no"
     compiled: bool = False
@@ -144,6 +157,27 @@ def flow_loss(
     if light is not None:
         errors = errors + own * _mean_square(2 * light - 1 - batch["own"])
     return (errors * batch["weight"]).mean() if "weight" in batch else errors.mean()
+
+
+def response_loss(network: nn.Module, batch: Batch, factor: Tensor) -> Tensor:
+    """How far mini's light under strokes is from following their value: drawn light times factor (B,) has to
+    be that much more light there, as far as the display shows it. The mean squared error of the logarithm.
+    """
+    photo, light, mask = batch["photo"], batch["light"], batch["mask"]
+    x, sigma, mode = torch.zeros_like(photo), torch.ones_like(factor), torch.zeros_like(batch["mode"])
+    times = factor[:, None, None, None]
+
+    def lit(drawn: Tensor) -> Tensor:
+        velocity = network(x=x, sigma=sigma, photo=photo, light=drawn, mask=mask, mode=mode)
+        return torch.log(srgb_to_linear(photo - velocity.float() / RELIT_SCALE) + FLOOR)
+
+    with torch.no_grad():
+        before = lit(light)
+    white = math.log1p(FLOOR)
+    expected = before + torch.log((times * light + BOUNCED) / (light + BOUNCED))
+    told = mask * (before < 0)  # of what is all but burnt out, nothing more can be said
+    error = lit(times * light) - expected.clamp(max=white)
+    return (told * error.square()).sum() / told.sum().clamp_min(1)
 
 
 def _mean_square(error: Tensor) -> Tensor:
@@ -225,6 +259,10 @@ def _step(accelerator: Accelerator, network: nn.Module, state: State, batch: Bat
     noise *= draw_loud(len(noise), plan, generator).to(accelerator.device)
     with accelerator.autocast():
         loss = flow_loss(network, batch, sigma, noise, plan.own, plan.drawn, plan.edges)
+        if plan.response:
+            half = {name: value[: len(sigma) // 2] for name, value in batch.items()}
+            stops = 2 * STOPS * torch.rand(len(half["x0"]), generator=generator) - STOPS
+            loss = loss + plan.response * response_loss(network, half, torch.exp2(stops).to(sigma))
     accelerator.backward(loss)
     accelerator.clip_grad_norm_(state.weights, plan.clip)
     state.optimizer.step()

@@ -10,8 +10,20 @@ from safetensors.torch import load_file
 
 from dior_rt.errors import InputError
 from dior_rt.export.lora import merge_lora
-from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss
-from dior_rt.training.network import LORA, WEIGHTS, Config, Mini, load_network, save_network
+from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss, response_loss
+from dior_rt.training.network import (
+    BOUNCED,
+    FLOOR,
+    LORA,
+    RELIT_SCALE,
+    WEIGHTS,
+    Config,
+    Mini,
+    linear_to_srgb,
+    load_network,
+    save_network,
+    srgb_to_linear,
+)
 from dior_rt.training.triplets import Batches
 
 TINY = Config(width=32, depth=1, heads=2, patch=8, fine=4, half=8, quarter=16)
@@ -202,3 +214,34 @@ def test_training_goes_on_from_weights_with_their_sizes(tmp_path, renders):
     assert end.config == config
     for (name, weight), other in zip(start.named_parameters(), end.parameters(), strict=True):
         torch.testing.assert_close(other, weight, atol=1e-6, rtol=0, msg=name)
+
+
+class Brush(torch.nn.Module):
+    """Light under a stroke follows what is drawn to a power, and burns out at white."""
+
+    def __init__(self, power: float) -> None:
+        super().__init__()
+        self.power = torch.nn.Parameter(torch.tensor(power))
+
+    def forward(self, x, sigma, photo, light, mask, mode):
+        linear = srgb_to_linear(photo)
+        ratio = self.power * torch.log((light + BOUNCED) / (0.25 + BOUNCED)) * mask
+        relit = ((linear + FLOOR) * torch.exp(ratio) - FLOOR).clamp(0, 1)
+        return RELIT_SCALE * (photo - linear_to_srgb(relit))
+
+
+@pytest.mark.parametrize("power", [1.0, 0.5])
+def test_light_has_to_follow_the_value_drawn(power):
+    photo = torch.full((4, 3, 8, 8), 0.5)
+    mask = torch.zeros(4, 1, 8, 8)
+    mask[..., 3:5, 3:5] = 1
+    batch = {"photo": photo, "light": 0.2 * mask.expand(4, 3, 8, 8), "mask": mask}
+    batch["mode"] = torch.zeros(4, dtype=torch.int64)
+    brush, factor = Brush(power), torch.tensor([0.25, 0.5, 1.0, 2.0])
+    loss = response_loss(brush, batch, factor)
+    told = torch.log((0.2 * factor + BOUNCED) / (0.2 + BOUNCED))
+    torch.testing.assert_close(loss, ((1 - power) * told).square().mean(), atol=1e-4, rtol=1e-3)
+    loss.backward()
+    assert power == 1.0 or brush.power.grad < -0.1, "what follows too little is to follow more"
+    burnt = response_loss(Brush(1.0), {**batch, "light": 40 * batch["light"]}, factor)
+    assert float(burnt.detach()) == 0, "of what is burnt out nothing is asked"
