@@ -75,7 +75,7 @@ def test_a_tolerance_holds_against_the_reference_and_takes_fewer_steps(relighter
 @pytest.mark.parametrize("wall", [(0.6, 0.6, 0.6), (0.15, 0.2, 0.3)])
 @pytest.mark.parametrize("light", [(1.5, 0.9, 0.4), (0.02, 0.02, 0.02)])
 def test_a_dab_on_an_even_wall_leaves_no_ring(relighter, wall, light):
-    """Rings were left by a model that follows what is drawn less under a dab than just beside it."""
+    """Rings come of following what is drawn less under a dab than just beside it."""
     y, x = np.mgrid[:224, :320]
     shade = 0.8 + 0.3 * x / 320 + 0.1 * y / 224
     photo = np.round(255 * shade[..., None] * wall).astype(np.uint8)
