@@ -148,10 +148,11 @@ def flow_loss(
     answer = network(x=x, sigma=sigma, **inputs, **asked)
     velocity, light = answer if asked else (answer, None)
     error = x - s * velocity - x0
-    errors = _mean_square(error)  # (B,)
     if drawn:
         weight = 1 + drawn * batch["mask"]
-        errors = (weight * error.square()).flatten(1).mean(dim=1) / weight.flatten(1).mean(dim=1)
+        errors = (weight * error.square()).flatten(1).mean(dim=1) / weight.flatten(1).mean(dim=1)  # (B,)
+    else:
+        errors = _mean_square(error)
     if edges:
         errors = errors + edges * (_mean_square(error.diff(dim=2)) + _mean_square(error.diff(dim=3)))
     if light is not None:
