@@ -16,7 +16,6 @@ Raster = NDArray[np.float32]
 PERFECT: Final = 100.0  # dB; what equal pictures score
 RESAMPLES: Final = 2000
 DARK: Final = 1e-4  # linear light below which a logarithm says nothing
-WHITE: Final = 0.98  # mean linear light of what is burnt out: nothing is left to brighten
 
 
 def mean_square(one: Photo, other: Photo) -> float:
@@ -73,9 +72,8 @@ def log_slope(strengths: Sequence[float], light: Sequence[float]) -> float:
 
 
 def rising(values: Sequence[float]) -> bool:
-    """Whether every value, of linear light, exceeds the one before, where that is not burnt out already."""
-    before, after = np.array(values[:-1]), np.array(values[1:])
-    return bool(((after > before) | (np.minimum(before, after) >= WHITE)).all())
+    """Whether every value exceeds the one before."""
+    return bool((np.diff(values) > 0).all())
 
 
 def angle(one: NDArray, other: NDArray) -> float:
