@@ -44,8 +44,9 @@ LUMI_SCALE = 8.0
 BOUNCED = 0.02  # light where no source shines: it has bounced there, and drawn darkness is no black hole
 BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflows
 LITTLE = 0.01  # of the cells around drawn: half of what is said there holds
-EDGE = 1.5  # cells: how softly what is drawn ends beside a stroke
-TOUCHED = 0.25  # of the cells within that reach drawn: half of what is said there holds
+EDGE = 3.0  # cells: how softly what is drawn ends beside a stroke
+TOUCHED = 0.15  # of the cells within that reach drawn: half of what is said there holds
+COARSE = 4  # cells: the gates' own, between which they change evenly
 CLOSED = 2.0  # gates begin an eighth open
 LARGEST_LOGIT = 8.0
 MURK = 0.1  # noise ten times as strong as the image hides half of the state
@@ -127,6 +128,21 @@ def _gaussian(size: int, deviation: float, like: Tensor) -> Tensor:
     return weights / weights.sum(dim=1, keepdim=True)
 
 
+def even(cells: Tensor) -> Tensor:
+    """Every cell mixed with its neighbours by 1, 2, 1 both ways, (B, C, h, w) to the same.
+
+    Cells that are made of one get weights each of their own, and what these differ by would show in an even
+    sky as a weave; of two cells' period nothing is left.
+    """
+    return F.avg_pool2d(F.avg_pool2d(F.pad(cells, (1, 1, 1, 1), mode="replicate"), 2, 1), 2, 1)
+
+
+def coarse(cells: Tensor) -> Tensor:
+    """Means of COARSE x COARSE cells, and straight lines between them: (B, C, h, w) to the same."""
+    means = F.avg_pool2d(cells, COARSE)
+    return F.interpolate(means, scale_factor=COARSE, mode="bilinear", align_corners=False)
+
+
 def everywhere(cells: Tensor) -> Tensor:
     """The mean of the whole picture: (B, C, h, w) to (B, C, 1, 1)."""
     return cells.mean(dim=(2, 3), keepdim=True)
@@ -201,10 +217,14 @@ class Mini(nn.Module):
         light: Tensor,
         mask: Tensor,
         mode: Tensor,
+        own: Tensor | None = None,
         with_own: bool = False,
     ) -> Tensor | tuple[Tensor, Tensor]:
-        """The velocity; and, where asked for, what the network takes for the photo's own light, encoded."""
-        own = self.own_light(photo)
+        """The velocity; and, where asked for, what the network takes for the photo's own light, encoded.
+
+        own: that light, where it is known from a call before.
+        """
+        own = self.own_light(photo) if own is None else own
         towards = self.step(x, sigma, mode, *self.encode(photo, light, mask, own))
         return (towards, own) if with_own else towards
 
@@ -271,10 +291,10 @@ class Mini(nn.Module):
         cells = self.blend_half(cells + half)  # (B, 16, h, w)
         state = self.see_state(seen) * self.state_gate(condition)[: x.shape[0], :, None, None]
         cells = F.silu(self.smooth(cells + fine + state))
-        raw, own, gates = self.head(cells).float().split(3, dim=1)  # (B, 3, h, w)
+        raw, own, gates = even(self.head(cells).float()).split(3, dim=1)  # (B, 3, h, w)
         photo, linear, white, known, nearby, farther, anywhere = given.split(3, dim=1)
         # Gates say how much of what is drawn nearby, farther off, and everywhere holds beside the strokes.
-        near, far, wide = torch.sigmoid(gates - CLOSED).split(1, dim=1)
+        near, far, wide = coarse(torch.sigmoid(gates - CLOSED)).split(1, dim=1)
         ratio = raw + known + near * nearby + far * farther + wide * anywhere
         # Of white paper the light, encoded, is the photo itself.
         return _relight(photo, linear, ratio), white + own
@@ -282,15 +302,11 @@ class Mini(nn.Module):
     def _said(self, known: Tensor, mask: Tensor) -> list[Tensor]:
         """What is drawn under the strokes, going on beside them as it fades within a few cells; then what
         strokes say on average nearby, farther off and everywhere, for every cell that this leaves open."""
-        beside, patch = 1 - mask, self.config.patch
-        share = around(mask, EDGE)
-        open_ = beside * (TOUCHED / (share + TOUCHED))
-        means = [(around(known, far), around(mask, far)) for far in (patch / 2, patch)]
-        means.append((everywhere(known), everywhere(mask)))
-        return [
-            known + beside * (around(known, EDGE) / (share + TOUCHED)),
-            *(open_ * (said / (drawn + LITTLE)) for said, drawn in means),
-        ]
+        beside, patch, drawn = 1 - mask, self.config.patch, torch.cat([known, mask], dim=1)
+        touching, share = around(drawn, EDGE).split((3, 1), dim=1)
+        left = beside * (TOUCHED / (share + TOUCHED))
+        means = [spread(drawn, patch / 2), spread(drawn, patch), spread_everywhere(drawn)]
+        return [known + beside * (touching / (share + TOUCHED)), *(left * said[:, :3] for said in means)]
 
     def _transform(self, tokens: Tensor, condition: Tensor, turns: Turns) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells.

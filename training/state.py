@@ -80,7 +80,11 @@ class State:
             _fill(self.weights, [tensors[f"{k}.weight"] for k in range(len(shapes))])
             _fill(self.average.values, [tensors[f"{k}.average"] for k in range(len(shapes))])
             for k, weight in enumerate(self.weights):
-                moments = {key: tensors[f"{k}.{name}"].to(weight.device) for name, key in MOMENTS.items()}
+                # In the weight's own layout, which the fused optimiser takes for granted.
+                moments = {
+                    key: torch.empty_like(weight).copy_(tensors[f"{k}.{name}"])
+                    for name, key in MOMENTS.items()
+                }
                 self.optimizer.state[weight] = {"step": torch.tensor(float(head["step"])), **moments}
             self.average.updates, self.step = int(head["updates"]), int(head["step"])
         except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:

@@ -38,7 +38,7 @@ Grids = tuple[tuple[int, int], ...]  # (rows, columns) in cells
 GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
 CHANGES = ("change", "local", "dab")  # of one light, of one place, and of the place of a lone dab
 KINDS = (*CHANGES, "replace", "keep")
-KIND_SHARES = (0.14, 0.22, 0.32, 0.25, 0.07)
+KIND_SHARES = (0.26, 0.20, 0.20, 0.25, 0.09)
 GELS = ("local", "dab")  # changes of all lights alike, by any factor
 STOPS = 4.0  # by which these change, at most
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
@@ -243,10 +243,11 @@ def flat(lumi: Raster, mask: Raster) -> Raster:
 
 @dataclass(frozen=True)
 class Mix:
-    """The share of samples that estimate; of the others, the share without strokes, for guidance."""
+    """The share of samples that estimate, beside looking for the photo's own light as all do; of the others,
+    the share without strokes, for guidance."""
 
-    estimate: float = 0.08
-    null: float = 0.08
+    estimate: float = 0.04
+    null: float = 0.06
 
 
 class Batches(IterableDataset[dict[str, Tensor]]):

@@ -85,3 +85,19 @@ def test_a_dab_on_an_even_wall_leaves_no_ring(relighter, wall, light):
     ratio = np.abs(np.log((relit + 0.02) / (OPS.decode_srgb(photo) + 0.02)).mean(axis=2))
     rings = [ratio[(away >= 4 * k) & (away < 4 * k + 4)].mean() for k in range(25)]
     assert max(rings[4:]) < max(rings[:4]) + 0.15 and rings[-1] < 0.8 * max(rings[:4])
+
+
+@pytest.mark.parametrize("wall", [(0.6, 0.6, 0.6), (0.15, 0.2, 0.3)])
+@pytest.mark.parametrize("light", [(1.5, 0.9, 0.4), (0.02, 0.02, 0.02)])
+def test_an_even_wall_shows_no_cells(relighter, wall, light):
+    """What the network's cells differ by where the photo does not: the weave of its finer convolutions."""
+    y, x = np.mgrid[:224, :320]
+    shade = 0.8 + 0.3 * x / 320 + 0.1 * y / 224
+    photo = np.round(255 * shade[..., None] * wall).astype(np.uint8)
+    away = np.hypot(y - 112, x - 60)
+    strokes = Strokes(np.broadcast_to(np.float32(light), photo.shape), (away < 20).astype(np.float32))
+    relit = OPS.decode_srgb(relighter.relight(photo, strokes).picture)
+    ratio = np.log((relit + 0.02) / (OPS.decode_srgb(photo) + 0.02)).mean(axis=2)
+    cells = ratio.reshape(56, 4, 80, 4).mean(axis=(1, 3))[:, 30:]
+    for axis in (0, 1):
+        assert np.diff(cells, 2, axis=axis).std() < 0.01

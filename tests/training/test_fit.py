@@ -223,11 +223,12 @@ class Brush(torch.nn.Module):
         super().__init__()
         self.power = torch.nn.Parameter(torch.tensor(power))
 
-    def forward(self, x, sigma, photo, light, mask, mode):
+    def forward(self, x, sigma, photo, light, mask, mode, own=None, with_own=False):
         linear = srgb_to_linear(photo)
         ratio = self.power * torch.log((light + BOUNCED) / (0.25 + BOUNCED)) * mask
         relit = ((linear + FLOOR) * torch.exp(ratio) - FLOOR).clamp(0, 1)
-        return RELIT_SCALE * (photo - linear_to_srgb(relit))
+        velocity = RELIT_SCALE * (photo - linear_to_srgb(relit))
+        return (velocity, torch.full_like(photo, 0.25)) if with_own else velocity
 
 
 @pytest.mark.parametrize("power", [1.0, 0.5])

@@ -131,6 +131,7 @@ def test_the_photo_s_own_light_does_not_depend_on_strokes_state_or_time(awake) -
     for changed in ({**other, "photo": given["photo"]}, {**given, "light": 16 * given["light"]}):
         torch.testing.assert_close(awake(**changed, with_own=True)[1], own, atol=0, rtol=0)
     assert not torch.equal(awake(**other, with_own=True)[1], own)
+    torch.testing.assert_close(awake(**given, own=own), awake(**given), atol=0, rtol=0)
 
 
 @torch.no_grad()
@@ -164,6 +165,18 @@ def test_relit_light_stays_physical(awake) -> None:
     assert bright.clamp(0, 1).min() > 0.99 and dark.clamp(0, 1).max() < 0.01
     black = torch.zeros(1, 3, 4, 4)
     assert (module._relight(black, black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
+
+
+def test_no_weave_is_left_and_what_is_even_stays() -> None:
+    rows, columns = torch.meshgrid(torch.arange(16.0), torch.arange(24.0), indexing="ij")
+    slope = (0.3 * rows + 0.1 * columns)[None, None]
+    for weave in ((-1) ** rows, (-1) ** columns, (-1) ** (rows + columns)):
+        mixed = module.even(slope + weave)
+        torch.testing.assert_close(mixed[..., 1:-1, 1:-1], slope[..., 1:-1, 1:-1], atol=1e-5, rtol=0)
+        torch.testing.assert_close(module.coarse(slope + weave)[..., 2:-2, 2:-2], slope[..., 2:-2, 2:-2])
+    one = torch.full((2, 3, 8, 12), 0.7)
+    for flat in (module.even(one), module.coarse(one)):
+        torch.testing.assert_close(flat, one)
 
 
 def test_what_is_drawn_is_spread_as_it_is_and_no_farther_than_said() -> None:
