@@ -39,7 +39,10 @@ GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
 CHANGES = ("change", "local", "dab")  # of one light, of one place, and of the place of a lone dab
 KINDS = (*CHANGES, "replace", "keep")
 KIND_SHARES = (0.26, 0.20, 0.20, 0.25, 0.09)
-GELS = ("local", "dab")  # changes of all lights alike, by any factor
+# Of all lights alike, by any factor, in a part of the picture of these radii, of the shorter side: what a
+# lone dab says holds about it.
+PARTS = {"local": (0.15, 0.6), "dab": (0.1, 0.35)}
+FALL = (2.5, 8.0)  # the power of the distance by which they end
 STOPS = 4.0  # by which these change, at most
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
 DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
@@ -124,15 +127,18 @@ def exposed(image: Raster, white: float) -> float:
     return white / max(float(np.percentile(image.max(axis=2), 95)), 1e-4)
 
 
-def flag(rng: Generator, shape: tuple[int, int]) -> Raster:
-    """(h, w) in 0..1: what of a light passes where flags keep it off all but one soft-edged part."""
+def flag(rng: Generator, shape: tuple[int, int], radii: tuple[float, float]) -> Raster:
+    """(h, w) in 0..1: what of a light passes where flags keep it off all but one soft-edged part.
+
+    radii: the least and the most of the part's, of the shorter side.
+    """
     rows, columns = np.indices(shape) + 0.5
     x = (columns - rng.uniform(0, shape[1])) / min(shape)
     y = (rows - rng.uniform(0, shape[0])) / min(shape)
-    angle, wide, long = rng.uniform(0, np.pi), *np.exp(rng.uniform(np.log(0.15), np.log(0.6), 2))
+    angle, wide, long = rng.uniform(0, np.pi), *np.exp(rng.uniform(*np.log(radii), 2))
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
     away = np.hypot(along / long, across / wide)  # 1 where half of the light passes
-    return (1 / (1 + away ** rng.uniform(2, 8))).astype(np.float32)
+    return (1 / (1 + away ** rng.uniform(*FALL))).astype(np.float32)
 
 
 def pair(
@@ -151,13 +157,13 @@ def pair(
     lights = random_lights(rng, usable)
     relights = lights
     if kind in CHANGES:
-        relights = lights * gel(rng) if kind in GELS else change_one(rng, lights, usable)
+        relights = lights * gel(rng) if kind in PARTS else change_one(rng, lights, usable)
     elif kind == "replace":
         relights = random_lights(rng, usable)
     photo, source = mix(view, lights * balance)
     relit, target = mix(view, relights * balance)
-    if kind in ("local", "dab"):
-        passing = flag(rng, photo.shape[:2])[..., None]
+    if kind in PARTS:
+        passing = flag(rng, photo.shape[:2], PARTS[kind])[..., None]
         relit, target = photo + passing * (relit - photo), source + passing * (target - source)
     exposure, strength = exposed(photo, rng.uniform(0.3, 1.1)), 1.0
     # A picture lost in white teaches little. One changed light must stay itself beside the others, so the

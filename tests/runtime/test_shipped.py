@@ -72,32 +72,35 @@ def test_a_tolerance_holds_against_the_reference_and_takes_fewer_steps(relighter
     assert within.steps < reference.steps / 2 and np.sqrt(np.mean(error**2)) < 0.5 / 255
 
 
-@pytest.mark.parametrize("wall", [(0.6, 0.6, 0.6), (0.15, 0.2, 0.3)])
-@pytest.mark.parametrize("light", [(1.5, 0.9, 0.4), (0.02, 0.02, 0.02)])
-def test_a_dab_on_an_even_wall_leaves_no_ring(relighter, wall, light):
-    """Rings come of following what is drawn less under a dab than just beside it."""
+WALLS = pytest.mark.parametrize("wall", [(0.6, 0.6, 0.6), (0.15, 0.2, 0.3)])
+LIGHTS = pytest.mark.parametrize("light", [(1.5, 0.9, 0.4), (0.02, 0.02, 0.02)])
+
+
+def dab_on_a_wall(relighter, wall, light, column):
+    """An even wall, 224 x 320, with one dab: the logarithm of its change of light, and how far the dab is."""
     y, x = np.mgrid[:224, :320]
     shade = 0.8 + 0.3 * x / 320 + 0.1 * y / 224
     photo = np.round(255 * shade[..., None] * wall).astype(np.uint8)
-    away = np.hypot(y - 112, x - 160)
+    away = np.hypot(y - 112, x - column)
     strokes = Strokes(np.broadcast_to(np.float32(light), photo.shape), (away < 20).astype(np.float32))
     relit = OPS.decode_srgb(relighter.relight(photo, strokes).picture)
-    ratio = np.abs(np.log((relit + 0.02) / (OPS.decode_srgb(photo) + 0.02)).mean(axis=2))
-    rings = [ratio[(away >= 4 * k) & (away < 4 * k + 4)].mean() for k in range(25)]
+    return np.log((relit + 0.02) / (OPS.decode_srgb(photo) + 0.02)).mean(axis=2), away
+
+
+@WALLS
+@LIGHTS
+def test_a_dab_on_an_even_wall_leaves_no_ring(relighter, wall, light):
+    """Rings come of following what is drawn less under a dab than just beside it."""
+    ratio, away = dab_on_a_wall(relighter, wall, light, 160)
+    rings = [np.abs(ratio)[(away >= 4 * k) & (away < 4 * k + 4)].mean() for k in range(25)]
     assert max(rings[4:]) < max(rings[:4]) + 0.15 and rings[-1] < 0.8 * max(rings[:4])
 
 
-@pytest.mark.parametrize("wall", [(0.6, 0.6, 0.6), (0.15, 0.2, 0.3)])
-@pytest.mark.parametrize("light", [(1.5, 0.9, 0.4), (0.02, 0.02, 0.02)])
+@WALLS
+@LIGHTS
 def test_an_even_wall_shows_no_cells(relighter, wall, light):
     """What the network's cells differ by where the photo does not: the weave of its finer convolutions."""
-    y, x = np.mgrid[:224, :320]
-    shade = 0.8 + 0.3 * x / 320 + 0.1 * y / 224
-    photo = np.round(255 * shade[..., None] * wall).astype(np.uint8)
-    away = np.hypot(y - 112, x - 60)
-    strokes = Strokes(np.broadcast_to(np.float32(light), photo.shape), (away < 20).astype(np.float32))
-    relit = OPS.decode_srgb(relighter.relight(photo, strokes).picture)
-    ratio = np.log((relit + 0.02) / (OPS.decode_srgb(photo) + 0.02)).mean(axis=2)
+    ratio, _ = dab_on_a_wall(relighter, wall, light, 60)
     cells = ratio.reshape(56, 4, 80, 4).mean(axis=(1, 3))[:, 30:]
     for axis in (0, 1):
         assert np.diff(cells, 2, axis=axis).std() < 0.01

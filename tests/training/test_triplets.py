@@ -14,6 +14,7 @@ from dior_rt.training.network import decode_light, linear_to_srgb
 from dior_rt.training.triplets import (
     GRIDS,
     KINDS,
+    PARTS,
     Batches,
     Mix,
     Pair,
@@ -206,9 +207,14 @@ def test_at_a_lone_dab_pictures_and_maps_change_by_one_factor(views) -> None:
 
 def test_flags_let_light_pass_in_one_part() -> None:
     for seed in range(20):
-        passing = flag(np.random.default_rng(seed), (48, 64))
+        passing = flag(np.random.default_rng(seed), (48, 64), (0.15, 0.6))
         assert passing.shape == (48, 64) and passing.dtype == np.float32
         assert passing.min() >= 0 and 0.5 < passing.max() <= 1
+    wide, narrow = (
+        np.mean([flag(np.random.default_rng(k), (48, 64), PARTS[kind]).mean() for k in range(20)])
+        for kind in ("local", "dab")
+    )
+    assert narrow < 0.6 * wide
 
 
 def test_lone_strokes_are_for_single_places(views) -> None:
