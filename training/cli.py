@@ -63,10 +63,10 @@ def fit(
     precision: Precision = "no",
     compiled: Annotated[bool, typer.Option("--compile", help="Minutes at first, then faster steps.")] = False,
     drawn: Annotated[float, typer.Option(min=0, help="How much more errors count under strokes.")] = 4.0,
-    edges: Annotated[float, typer.Option(min=0, help="Of the loss on differences between cells.")] = 0.15,
+    edges: Annotated[float, typer.Option(min=0, help="Of the loss on differences between cells.")] = 0.5,
     response: Annotated[
         float, typer.Option(min=0, help="Of the loss on twice the value being twice the light.")
-    ] = 1.0,
+    ] = 0.5,
     start: Annotated[
         Path | None, typer.Option(metavar="FILE", help="model.safetensors to go on from, with its sizes.")
     ] = None,
