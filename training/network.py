@@ -46,7 +46,6 @@ BRIGHTEST = 4.0  # of the encoded light: 820 times white, far below what overflo
 LITTLE = 0.01  # of the cells around drawn: half of what is said there holds
 EDGE = 3.0  # cells: how softly what is drawn ends beside a stroke
 TOUCHED = 0.15  # of the cells within that reach drawn: half of what is said there holds
-COARSE = 4  # cells: the gates' own, between which they change evenly
 CLOSED = 2.0  # gates begin an eighth open
 LARGEST_LOGIT = 8.0
 MURK = 0.1  # noise ten times as strong as the image hides half of the state
@@ -135,12 +134,6 @@ def even(cells: Tensor) -> Tensor:
     sky as a weave; of two cells' period nothing is left.
     """
     return F.avg_pool2d(F.avg_pool2d(F.pad(cells, (1, 1, 1, 1), mode="replicate"), 2, 1), 2, 1)
-
-
-def coarse(cells: Tensor) -> Tensor:
-    """Means of COARSE x COARSE cells, and straight lines between them: (B, C, h, w) to the same."""
-    means = F.avg_pool2d(cells, COARSE)
-    return F.interpolate(means, scale_factor=COARSE, mode="bilinear", align_corners=False)
 
 
 def everywhere(cells: Tensor) -> Tensor:
@@ -294,7 +287,7 @@ class Mini(nn.Module):
         raw, own, gates = even(self.head(cells).float()).split(3, dim=1)  # (B, 3, h, w)
         photo, linear, white, known, nearby, farther, anywhere = given.split(3, dim=1)
         # Gates say how much of what is drawn nearby, farther off, and everywhere holds beside the strokes.
-        near, far, wide = coarse(torch.sigmoid(gates - CLOSED)).split(1, dim=1)
+        near, far, wide = torch.sigmoid(gates - CLOSED).split(1, dim=1)
         ratio = raw + known + near * nearby + far * farther + wide * anywhere
         # Of white paper the light, encoded, is the photo itself.
         return _relight(photo, linear, ratio), white + own
@@ -306,7 +299,12 @@ class Mini(nn.Module):
         touching, share = around(drawn, EDGE).split((3, 1), dim=1)
         left = beside * (TOUCHED / (share + TOUCHED))
         means = [spread(drawn, patch / 2), spread(drawn, patch), spread_everywhere(drawn)]
-        return [known + beside * (touching / (share + TOUCHED)), *(left * said[:, :3] for said in means)]
+        said = [known + beside * (touching / (share + TOUCHED)), *(left * told[:, :3] for told in means)]
+        # Where a stroke ends all this steps, and what is added to it in the end cannot: it is mixed with its
+        # neighbours, and so is this there, or a thin line would be left about the stroke.
+        mixed = even(mask)
+        ends = 4 * mixed * (1 - mixed)
+        return [plane + ends * (even(plane) - plane) for plane in said]
 
     def _transform(self, tokens: Tensor, condition: Tensor, turns: Turns) -> Tensor:
         """The transformer: (B, width, rows, columns) to features of every 4 x 4 cells.

@@ -173,10 +173,8 @@ def test_no_weave_is_left_and_what_is_even_stays() -> None:
     for weave in ((-1) ** rows, (-1) ** columns, (-1) ** (rows + columns)):
         mixed = module.even(slope + weave)
         torch.testing.assert_close(mixed[..., 1:-1, 1:-1], slope[..., 1:-1, 1:-1], atol=1e-5, rtol=0)
-        torch.testing.assert_close(module.coarse(slope + weave)[..., 2:-2, 2:-2], slope[..., 2:-2, 2:-2])
     one = torch.full((2, 3, 8, 12), 0.7)
-    for flat in (module.even(one), module.coarse(one)):
-        torch.testing.assert_close(flat, one)
+    torch.testing.assert_close(module.even(one), one)
 
 
 def test_what_is_drawn_is_spread_as_it_is_and_no_farther_than_said() -> None:
@@ -210,9 +208,10 @@ def test_light_drawn_ends_softly_beside_a_stroke() -> None:
     relit = given["photo"] + found(Mini(SMALL), given) / 4
     row = torch.log(srgb_to_linear(relit[0, 0, 32]) + module.FLOOR)
     row = (row - row[0]) / (row[31] - row[0])
-    assert (row[30:34] - 1).abs().max() < 1e-3, "under the stroke it is what was drawn"
-    falls = -row[33:].diff()
-    assert 0 < falls[0] < 0.45 and falls.max() < 0.45 and falls.min() > -1e-4
+    assert (row[31:33] - 1).abs().max() < 1e-3, "under the stroke it is what was drawn"
+    assert (row[[30, 33]] - 1).abs().max() < 0.15, "and next to its edge nearly"
+    falls = -row[32:].diff()
+    assert 0 < falls[0] < 0.2 and falls.max() < 0.2 and falls.min() > -1e-4
 
 
 def test_colour_is_the_kernels_colour() -> None:
