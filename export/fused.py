@@ -31,8 +31,16 @@ def _log(x: Any) -> Any:
     return opset23.ReduceLogSum(opset23.Unsqueeze(x, last), last, keepdims=0)
 
 
+def _log1p(x: Any) -> Any:
+    one: Any = opset23.Constant(value_floats=[1.0])
+    return _log(opset23.Add(x, one))
+
+
 #: How torch's exporter writes its operations, where not as it likes.
-TRANSLATIONS: Final[dict[Callable, Callable]] = {torch.ops.aten.log.default: _log}
+TRANSLATIONS: Final[dict[Callable, Callable]] = {
+    torch.ops.aten.log.default: _log,
+    torch.ops.aten.log1p.default: _log1p,
+}
 
 
 def fused(network: Mini) -> Mini:
