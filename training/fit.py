@@ -99,7 +99,7 @@ def fit(renders: Path, out: Path, start: Config | Path, plan: Plan, progress: Pr
     torch.manual_seed(plan.seed)
     network = Mini(start) if isinstance(start, Config) else load_network(start)
     # Convolutions of channels that lie side by side take two thirds of a step's time on CPUs.
-    network = network.to(memory_format=torch.channels_last)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # in place
 
     def save(network: nn.Module) -> None:
         assert isinstance(network, Mini)

@@ -135,7 +135,8 @@ def flag(rng: Generator, shape: tuple[int, int], radii: tuple[float, float]) -> 
     rows, columns = np.indices(shape) + 0.5
     x = (columns - rng.uniform(0, shape[1])) / min(shape)
     y = (rows - rng.uniform(0, shape[0])) / min(shape)
-    angle, wide, long = rng.uniform(0, np.pi), *np.exp(rng.uniform(*np.log(radii), 2))
+    angle = rng.uniform(0, np.pi)
+    wide, long = np.exp(rng.uniform(np.log(radii[0]), np.log(radii[1]), 2))
     along, across = x * np.cos(angle) + y * np.sin(angle), y * np.cos(angle) - x * np.sin(angle)
     away = np.hypot(along / long, across / wide)  # 1 where half of the light passes
     return (1 / (1 + away ** rng.uniform(*FALL))).astype(np.float32)
