@@ -198,6 +198,7 @@ class Mini(nn.Module):
         self.state_gate = nn.Linear(width, fine)
         self.smooth = nn.Conv2d(fine, fine, 3, padding=1)
         self.head = nn.Conv2d(fine, 9, 3, padding=1)
+        self.mix: nn.Module = Even()
         for silent in (self.modulation, self.state_gate, self.head):
             for weight in silent.parameters():
                 nn.init.zeros_(weight)
@@ -284,7 +285,7 @@ class Mini(nn.Module):
         cells = self.blend_half(cells + half)  # (B, 16, h, w)
         state = self.see_state(seen) * self.state_gate(condition)[: x.shape[0], :, None, None]
         cells = F.silu(self.smooth(cells + fine + state))
-        raw, own, gates = even(self.head(cells).float()).split(3, dim=1)  # (B, 3, h, w)
+        raw, own, gates = self.mix(self.head(cells).float()).split(3, dim=1)  # (B, 3, h, w)
         photo, linear, white, known, nearby, farther, anywhere = given.split(3, dim=1)
         # Gates say how much of what is drawn nearby, farther off, and everywhere holds beside the strokes.
         near, far, wide = torch.sigmoid(gates - CLOSED).split(1, dim=1)
@@ -322,6 +323,13 @@ class Mini(nn.Module):
             tokens = block(tokens, vectors[6 * index : 6 * index + 6], turns)
         tokens = _norm(tokens.unflatten(1, (rows, columns)))
         return self.divide_tokens(tokens.movedim(3, 1), self.unembed)
+
+
+class Even(nn.Module):
+    """`even`, as a part of the network that can be left out."""
+
+    def forward(self, cells: Tensor) -> Tensor:
+        return even(cells)
 
 
 class DivideTokens(nn.Module):

@@ -34,7 +34,8 @@ class AboutEstimate(nn.Module):
 
 
 def sever(network: Mini) -> None:
-    """Let no convolution after the transformer look beyond its own cell, now and in training."""
+    """Let nothing after the transformer look beyond its own cell, now and in training."""
+    network.mix = nn.Identity()
     for layer in (network.blend_quarter.blend, network.blend_half.blend, network.smooth, network.head):
         own = torch.zeros(layer.kernel_size)
         own[1, 1] = 1
