@@ -24,6 +24,7 @@ from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
+from dior_rt.reach import check_reach, within_reach
 from dior_rt.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.schedule import ShiftSchedule
 from dior_rt.stopwatch import Stopwatch
@@ -49,8 +50,8 @@ class Relit:
     """A relit photo and how it came about.
 
     picture: of the photo's kind, dtype and size. notice: what the person should know, or None.
-    seconds: by stage (kernels, steps, transfer). steps: as many as were taken. sampling, seed, intensity:
-    as used.
+    seconds: by stage (kernels, steps, transfer). steps: as many as were taken. sampling, seed, intensity,
+    reach: as used.
     """
 
     picture: Picture
@@ -60,6 +61,7 @@ class Relit:
     sampling: Sampling
     seed: int
     intensity: float
+    reach: float | None
 
     @property
     def guidance(self) -> float:
@@ -127,6 +129,7 @@ class Relighter:
         tolerance: float | None = None,
         seed: int = 0,
         intensity: float = 1.0,
+        reach: float | None = None,
         progress: Progress | None = None,
     ) -> Relit:
         """The photo under the light of the strokes.
@@ -137,7 +140,8 @@ class Relighter:
         Stroke, in pixels of the photo.
         preset: "reference" or a faster one of the model's own, such as "fast"; see `Relighter.presets`.
         steps, solver, shift, guidance, interval, tolerance: each goes over the preset's where it is not None;
-        see `Sampling`. intensity: multiplies the light, >= 0.
+        see `Sampling`. intensity: multiplies the light, >= 0. reach: how far from the strokes light changes,
+        in longer sides of the photo, see `within_reach`; None: as far as the model takes it.
         progress: called after each step with (step, steps), of which it passes several at a time where the
         solver chooses its own; returning False stops with Cancelled.
 
@@ -155,21 +159,24 @@ class Relighter:
         )
         _check_seed(seed)
         _check_intensity(intensity)
+        check_reach(reach)
         watch = Stopwatch()
         pixels = read_pixels(photo)
         raster = self._family.raster(*pixels.shape[:2])
         drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
         if not drawn.mask.any():
-            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity)
+            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
         source, encoded = self._reduce_photo(pixels, raster)
         watch.lap("kernels")
         condition = self._family.encode(encoded, drawn, "relight")
         x0, taken = self._sample(condition, how, seed, progress)
         watch.lap("steps")
         relit = _linear(self._family.decode_relit(x0, condition))
+        if reach is not None:
+            relit = within_reach(source, relit, drawn.mask, reach)
         picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
         watch.lap("transfer")
-        return Relit(picture, None, watch.seconds, taken, how, seed, intensity)
+        return Relit(picture, None, watch.seconds, taken, how, seed, intensity, reach)
 
     @_device_errors()
     def estimate(

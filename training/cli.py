@@ -235,9 +235,14 @@ def evaluate(
     ],
     views: Annotated[int, typer.Option(min=1, help="How many pairs of each kind at most.")] = 80,
     dabs: Annotated[int, typer.Option(min=0, help="On renders: how many views the brush visits.")] = 10,
-    steps: Annotated[int | None, typer.Option(min=1, help="Also with so many steps.")] = None,
-    guidance: Annotated[float | None, typer.Option(min=0, help="Also with this guidance.")] = None,
-    noise_scale: Annotated[float | None, typer.Option(min=0, help="Also from noise so strong.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of the flow [default: the bundle's own].")] = None,
+    guidance: Annotated[float | None, typer.Option(min=0, help="[default: the bundle's own]")] = None,
+    noise_scale: Annotated[
+        float | None, typer.Option(min=0, help="Of the start [default: the bundle's own].")
+    ] = None,
+    reach: Annotated[
+        float | None, typer.Option(help="How far from the strokes light changes, see `dior-rt relight`.")
+    ] = None,
     lpips: Annotated[bool, typer.Option("--lpips", help="Also LPIPS (needs dior-rt[lpips]).")] = False,
     photos: Annotated[Path | None, typer.Option(help="Photos to look for patch borders in.")] = None,
     out: Annotated[
@@ -247,8 +252,7 @@ def evaluate(
 ) -> None:
     """Measure how well a bundle relights, beside baselines, and how it answers to the brush.
 
-    With the bundle's own settings, and once more with those given. Pictures of another method are called
-    {task}.png; a name that is missing is told.
+    Pictures of another method are called {task}.png; a name that is missing is told.
     """
     from dior_rt.files import make_folder
     from dior_rt.training.evaluation.methods import Settings
@@ -259,10 +263,11 @@ def evaluate(
     if out:
         make_folder(out)  # now, rather than after the work
     plan = Plan(views, dabs, lpips, photos)
-    evaluations, examples = evaluate(method, benchmark, Settings(steps, guidance, noise_scale), plan)
+    settings = Settings(steps, guidance, noise_scale, reach)
+    evaluation, examples = evaluate(method, benchmark, settings, plan)
     if out:
-        write_report(out, evaluations, examples)
-    typer.echo(to_json(evaluations) if as_json else markdown(evaluations))
+        write_report(out, evaluation, examples)
+    typer.echo(to_json(evaluation) if as_json else markdown(evaluation))
 
 
 @app.command()
@@ -307,8 +312,8 @@ def ablation(
 
     budget = replace(budget, stage1=stage1, lora=lora)
     evaluation, examples = ablate(maps, held_out, renders, out, budget, tell)
-    write_report(out, [evaluation], examples)
-    typer.echo(markdown([evaluation]))
+    write_report(out, evaluation, examples)
+    typer.echo(markdown(evaluation))
 
 
 @app.command()
@@ -336,8 +341,8 @@ def recipes(
     plan = replace(PLAN, steps=steps, batch=batch, precision=precision, seed=seed)
     with _Bar(total_steps(plan)) as bar:
         evaluation, examples = study(renders, held_out, out, plan, progress=bar.show)
-    write_report(out, [evaluation], examples)
-    typer.echo(markdown([evaluation]))
+    write_report(out, evaluation, examples)
+    typer.echo(markdown(evaluation))
 
 
 class _Bar:

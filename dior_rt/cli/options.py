@@ -76,5 +76,13 @@ Seed = Annotated[int, typer.Option(min=0, help="The same seed gives the same pic
 Intensity = Annotated[
     float, typer.Option(min=0, callback=_finite, help="Multiplies the light of all strokes.")
 ]
+Reach = Annotated[
+    float | None,
+    typer.Option(
+        callback=_finite,
+        help="How far from the strokes light changes, as a share of the photo's longer side; 0.1 paints one "
+        "lamp and leaves the rest [default: as far as the model takes it].",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object that says what was done.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

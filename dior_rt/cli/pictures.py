@@ -49,6 +49,7 @@ def relight(
     tolerance: options.Tolerance = None,
     seed: options.Seed = 0,
     intensity: options.Intensity = 1.0,
+    reach: options.Reach = None,
     key: Annotated[
         Literal["black"] | None, typer.Option(help="Read what is exactly black in STROKES as unspecified.")
     ] = None,
@@ -66,6 +67,8 @@ def relight(
     One warm stroke, three times as strong, into a TIFF:
       echo '[{"points": [[80, 120], [240, 300]], "width": 40, "color": "#ffb060"}]' > warm.json
       dior-rt relight photo.jpg warm.json --intensity 3 -o warm.tif
+    One more lamp, and the rest of the photo as it is:
+      dior-rt relight photo.jpg strokes.png --reach 0.1
     A picture whose black means "not drawn":
       dior-rt relight photo.jpg light.jpg --key black
     Fast, or within half a level of 255 of what all the steps would give:
@@ -100,6 +103,7 @@ def relight(
             tolerance=tolerance,
             seed=seed,
             intensity=intensity,
+            reach=reach,
             progress=watch.first_step(advance),
         )
     watch.lap("relight")
@@ -108,6 +112,7 @@ def relight(
         "steps": relit.steps,
         "seed": relit.seed,
         "intensity": relit.intensity,
+        "reach": relit.reach,
     }
     write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
     watch.lap("write")

@@ -131,6 +131,17 @@ def test_intensity_multiplies_the_light(relight) -> None:
     assert (pixels("a.png") != pixels("c.png")).any()
 
 
+def test_within_a_short_reach_the_photo_stays_far_from_the_strokes(relight) -> None:
+    Path("one.json").write_text(json.dumps([{"points": [[5, 5], [10, 5]], "width": 8, "intensity": 4}]))
+    assert relight("-o", "far.png", strokes="one.json") == 0
+    assert relight("-o", "near.png", "--reach", "0.05", strokes="one.json") == 0
+    corner = slice(HEIGHT // 2, None), slice(WIDTH // 2, None)
+    assert (pixels("far.png")[corner] != pixels("photo.png")[corner]).any()
+    np.testing.assert_array_equal(pixels("near.png")[corner], pixels("photo.png")[corner])
+    assert (pixels("near.png")[:10, :15] != pixels("photo.png")[:10, :15]).any()
+    assert [read_settings(Path(f"{name}.png"))["reach"] for name in ("near", "far")] == [0.05, None]
+
+
 def test_strokes_of_another_size_but_the_same_shape(relight) -> None:
     with Image.open("strokes.png") as image:
         image.resize((WIDTH * 4, HEIGHT * 4), Image.Resampling.NEAREST).save("large.png")
@@ -250,6 +261,8 @@ def refuses(folder: Path, capfd):
         (["--intensity", "-1"], "--intensity"),
         (["--intensity", "nan"], "--intensity"),
         (["--seed", "-1"], "--seed"),
+        (["--reach", "0"], "reach"),
+        (["--reach", "inf"], "--reach"),
         (["--key", "white"], "--key"),
         (["--colour", "red"], "--colour"),
         (["third"], "third"),

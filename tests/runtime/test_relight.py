@@ -216,6 +216,10 @@ def test_an_estimate_is_a_light_map_of_the_grid(relighter):
         ({"intensity": float("inf")}, "intensity"),
         ({"intensity": 3e38}, "too strong"),
         ({"seed": -1}, "seed"),
+        ({"reach": 0.0}, "reach"),
+        ({"reach": -1.0}, "reach"),
+        ({"reach": float("nan")}, "reach"),
+        ({"reach": float("inf")}, "reach"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(relighter, settings, says):

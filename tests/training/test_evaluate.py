@@ -1,7 +1,6 @@
 """The evaluation: baselines with known answers, methods beside them, the report; a bundle from end to end."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from dior_rt.kernels import NumpyOps
 from dior_rt.relight import Relighter
 from dior_rt.training.evaluation.baselines import gain, match, quotient
 from dior_rt.training.evaluation.benchmarks import open_benchmarks
-from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_methods
+from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_method
 from dior_rt.training.evaluation.report import CELL, GAP, as_json, contact_sheet, markdown, write_report
 from dior_rt.training.evaluation.results import Evaluation, Example, Figure
 from dior_rt.training.evaluation.run import Plan, evaluate, run
@@ -66,7 +65,7 @@ def test_the_quotient_of_maps_smaller_than_the_photo() -> None:
 
 
 def test_another_method_stands_beside_the_baselines(renders, answers) -> None:
-    (method,) = open_methods(answers, Settings())
+    method = open_method(answers, Settings())
     assert isinstance(method, Pictures)
     replaced, changed = (run(method, found)[0] for found in open_benchmarks(renders))
     rows = {row.method: row for row in replaced.rows}
@@ -100,41 +99,40 @@ def test_pictures_that_are_missing_or_of_another_size(renders, answers, tmp_path
 
 def test_a_folder_that_is_no_method(tmp_path) -> None:
     with pytest.raises(BundleError):
-        open_methods(tmp_path, Settings())
+        open_method(tmp_path, Settings())
 
 
-def test_a_bundle_is_measured_with_its_own_settings_and_those_asked_for(mini_bundle, renders) -> None:
-    own, asked = open_methods(mini_bundle, Settings(steps=1, noise_scale=0.0))
+def test_a_bundle_is_measured_with_its_own_settings_or_those_asked_for(mini_bundle, renders) -> None:
+    own = open_method(mini_bundle, Settings())
+    asked = open_method(mini_bundle, Settings(steps=1, noise_scale=0.0, reach=0.1))
     manifest = Relighter(mini_bundle, ops="numpy").bundle.manifest
-    assert own.settings == Settings(manifest.steps, manifest.guidance, manifest.noise_scale)
-    assert asked.settings == Settings(1, manifest.guidance, 0.0)
-    assert len(open_methods(mini_bundle, Settings(steps=manifest.steps))) == 1
+    assert own.settings == Settings(manifest.steps, manifest.guidance, manifest.noise_scale, None)
+    assert asked.settings == Settings(1, manifest.guidance, 0.0, 0.1)
     task = next(iter(open_benchmarks(renders)[0]))
-    strokes = task.control("dense")
+    strokes = task.control("strokes")
     relit = own.relight(task.source, strokes)
     assert np.array_equal(relit, own.relight(task.source, strokes))
-    assert not np.array_equal(relit, asked.relight(task.source, strokes))
+    same = asked.relighter.relight(task.source, strokes, steps=1, reach=0.1).picture
+    assert np.array_equal(same, asked.relight(task.source, strokes)) and not np.array_equal(relit, same)
 
 
 def test_a_bundle_from_end_to_end(mini_bundle, renders, tmp_path) -> None:
-    plan = Plan(views=2, dabs=1)
     Image.fromarray(np.tile(PHOTO, (2, 2, 1))).save(tmp_path / "photo.png")
-    plan = replace(plan, photos=tmp_path)
-    evaluations, examples = evaluate(mini_bundle, renders, Settings(steps=1), plan)
-    assert [evaluation.settings.steps for evaluation in evaluations] == [4, 1]
+    plan = Plan(views=2, dabs=1, photos=tmp_path)
+    evaluation, examples = evaluate(mini_bundle, renders, Settings(steps=1, reach=0.5), plan)
     assert len(examples) == 4 and all(example.strokes for example in examples)
-    for evaluation in evaluations:
-        assert [table.benchmark for table in evaluation.tables] == ["replace", "change"]
-        for table in evaluation.tables:
-            assert table.pictures == 2 and table.estimate and np.isfinite(table.estimate.mean)
-            controls = [row.control for row in table.rows]
-            assert controls[3:] == ["true maps", "estimated maps", "dense", "strokes"]
-            assert table.rows[-1].seconds > 0
-        assert evaluation.control.response.dabs == 1 and evaluation.borders.photos == 1
-    text = markdown(evaluations)
-    assert text.count("| strokes |") == 4 and "cut from the true Lumi map" in text
-    assert json.loads(as_json(evaluations))[1]["control"]["response"]["dabs"] == 1
-    write_report(tmp_path / "report", evaluations, examples)
+    assert [table.benchmark for table in evaluation.tables] == ["replace", "change"]
+    for table in evaluation.tables:
+        assert table.pictures == 2 and table.estimate and np.isfinite(table.estimate.mean)
+        controls = [row.control for row in table.rows]
+        assert controls[3:] == ["true maps", "estimated maps", "dense", "strokes"]
+        assert table.rows[-1].seconds > 0
+    assert evaluation.control.response.dabs == 1 and evaluation.borders.photos == 1
+    text = markdown(evaluation)
+    assert text.startswith("**small**: 1 steps, guidance 2, noise 1, reach 0.5\n")
+    assert text.count("| strokes |") == 2 and "cut from the true Lumi map" in text
+    assert json.loads(as_json(evaluation))["control"]["response"]["dabs"] == 1
+    write_report(tmp_path / "report", evaluation, examples)
     assert (tmp_path / "report" / "report.md").read_text() == text + "\n"
     assert json.loads((tmp_path / "report" / "report.json").read_text())
     with Image.open(tmp_path / "report" / "contact.png") as sheet:
@@ -146,7 +144,7 @@ def test_real_pairs_are_driven_by_light_estimated_from_the_target(mini_bundle, t
         grey = np.roll(np.tile(PHOTO, (2, 2, 1)), 9 * direction, axis=1)
         (tmp_path / "everett_d").mkdir(exist_ok=True)
         Image.fromarray(grey).save(tmp_path / "everett_d" / f"dir_{direction}_mip6.jpg")
-    (model,) = open_methods(mini_bundle, Settings())
+    model = open_method(mini_bundle, Settings())
     assert isinstance(model, Model)
     (found,) = open_benchmarks(tmp_path)
     table, examples = run(model, found.first(1))
@@ -156,7 +154,7 @@ def test_real_pairs_are_driven_by_light_estimated_from_the_target(mini_bundle, t
     lumi, strokes = model.estimate(task.truth), examples[0].strokes
     drawn = strokes.mask > 0
     assert np.array_equal(strokes.light[drawn], lumi[drawn])  # of the target, not of the source
-    assert "estimated from the target" in markdown([Evaluation(model.name, model.settings, (table,))])
+    assert "estimated from the target" in markdown(Evaluation(model.name, model.settings, (table,)))
 
 
 def test_the_contact_sheet_shows_what_it_says(renders) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from dior_rt.bundle import MANIFEST
 from dior_rt.errors import InputError
 from dior_rt.kernels import Strokes
+from dior_rt.reach import check_reach
 from dior_rt.relight import Relighter
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.metrics import Photo, Raster
@@ -19,27 +20,30 @@ from dior_rt.training.evaluation.tasks import Task
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of the runtime; None takes the bundle's own."""
+    """What is asked of the runtime; None takes the bundle's own, and of `reach` that the model decides."""
 
     steps: int | None = None
     guidance: float | None = None
     noise_scale: float | None = None
+    reach: float | None = None
 
 
 class Model:
     """A bundle by the runtime as people run it, one seed for all pictures. settings: as used."""
 
     def __init__(self, relighter: Relighter, settings: Settings = Settings()) -> None:
+        check_reach(settings.reach)
         given = {name: value for name, value in asdict(settings).items() if value is not None}
+        given.pop("reach", None)  # a bundle has none of its own
         manifest = replace(relighter.bundle.manifest, **given)
         self.relighter = copy(relighter)
         self.relighter.bundle = replace(relighter.bundle, manifest=manifest)
         self.name, self.grid = manifest.name, manifest.grid
-        self.settings = Settings(manifest.steps, manifest.guidance, manifest.noise_scale)
+        self.settings = Settings(manifest.steps, manifest.guidance, manifest.noise_scale, settings.reach)
 
     def relight(self, photo: Photo | Raster, strokes: Strokes) -> Photo:
         """The photo, 8-bit or float sRGB, under the strokes; what comes back is of its dtype."""
-        return np.asarray(self.relighter.relight(photo, strokes).picture)
+        return np.asarray(self.relighter.relight(photo, strokes, reach=self.settings.reach).picture)
 
     def estimate(self, photo: Photo) -> Raster:
         """The photo's own light on the light grid, (h, w, 3) linear."""
@@ -66,13 +70,8 @@ class Pictures:
         return picture
 
 
-def open_methods(folder: Path, asked: Settings) -> list[Model] | list[Pictures]:
-    """A bundle with its own settings, and with those asked for where they differ; or a folder of pictures.
-
-    Raises BundleError for a folder that is neither.
-    """
+def open_method(folder: Path, settings: Settings) -> Model | Pictures:
+    """A bundle under these settings, or a folder of pictures. Raises BundleError for one that is neither."""
     if not (folder / MANIFEST).exists() and any(folder.glob("*.png")):
-        return [Pictures(folder)]
-    relighter = Relighter(folder)
-    own, other = Model(relighter), Model(relighter, asked)
-    return [own] if own.settings == other.settings else [own, other]
+        return Pictures(folder)
+    return Model(Relighter(folder), settings)

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from dior_rt.files import make_folder, replacing
+from dior_rt.training.evaluation.methods import Settings
 from dior_rt.training.evaluation.metrics import Photo
 from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import OPS
@@ -24,29 +25,28 @@ COLUMNS: Final = ("source", "strokes", "result", "truth")
 DECIMALS: Final = {"PSNR": 2, "RMSE": 1}  # three for all others
 
 
-def write_report(folder: Path, evaluations: Sequence[Evaluation], examples: Sequence[Example]) -> None:
+def write_report(folder: Path, evaluation: Evaluation, examples: Sequence[Example]) -> None:
     """report.json, report.md and contact.png, each whole or not at all. Raises InputError."""
     make_folder(folder)
-    for name, text in (("report.json", as_json(evaluations)), ("report.md", markdown(evaluations))):
+    for name, text in (("report.json", as_json(evaluation)), ("report.md", markdown(evaluation))):
         with replacing(folder / name) as file:
             file.write((text + "\n").encode())
     with replacing(folder / "contact.png") as file:
         contact_sheet(examples).save(file, "PNG")
 
 
-def as_json(evaluations: Sequence[Evaluation]) -> str:
+def as_json(evaluation: Evaluation) -> str:
     """Every figure, unrounded."""
-    return json.dumps([asdict(evaluation) for evaluation in evaluations], indent=2)
+    return json.dumps(asdict(evaluation), indent=2)
 
 
-def markdown(evaluations: Sequence[Evaluation]) -> str:
+def markdown(evaluation: Evaluation) -> str:
     """Tables, each mean with its 95 % interval, and what the brush does in a few lines."""
-    return "\n\n".join("\n\n".join(_sections(evaluation)) for evaluation in evaluations)
+    return "\n\n".join(_sections(evaluation))
 
 
 def _sections(evaluation: Evaluation) -> Iterator[str]:
-    used = evaluation.settings
-    settings = f": {used.steps} steps, guidance {used.guidance:g}, noise {used.noise_scale:g}" if used else ""
+    settings = f": {_settings(evaluation.settings)}" if evaluation.settings else ""
     yield f"**{evaluation.method}**{settings}"
     for table in evaluation.tables:
         yield _table(table)
@@ -57,6 +57,11 @@ def _sections(evaluation: Evaluation) -> Iterator[str]:
             f"- differences across patch borders over those inside, {borders.photos} photos: "
             f"{borders.relit:.3f} in relit light, {borders.estimated:.3f} in estimated light"
         )
+
+
+def _settings(used: Settings) -> str:
+    reach = f", reach {used.reach:g}" if used.reach else ""
+    return f"{used.steps} steps, guidance {used.guidance:g}, noise {used.noise_scale:g}{reach}"
 
 
 def _table(table: Table) -> str:

@@ -18,7 +18,7 @@ from dior_rt.training.evaluation.baselines import gain, match, quotient
 from dior_rt.training.evaluation.benchmarks import open_benchmarks, renders
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.lpips import BACKBONES, Lpips
-from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_methods
+from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_method
 from dior_rt.training.evaluation.metrics import Photo, psnr, rmse, scaled_psnr, ssim
 from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import DRAWN, OPS, Benchmark, Task
@@ -58,28 +58,22 @@ class Plan:
 
 
 def evaluate(
-    folder: Path, benchmark: Path, asked: Settings, plan: Plan
-) -> tuple[list[Evaluation], list[Example]]:
-    """A bundle with its own settings, and once more with those asked for where they differ; or the pictures
-    of another method. The examples are those of the first. Raises what reading raises."""
-    benchmarks = [found.first(plan.views) for found in open_benchmarks(benchmark)]
-    methods = open_methods(folder, asked)
-    photos = list_photos(plan.photos) if plan.photos else []
+    folder: Path, benchmark: Path, settings: Settings, plan: Plan
+) -> tuple[Evaluation, list[Example]]:
+    """A bundle under these settings, or the pictures of another method. Raises what reading raises."""
+    method = open_method(folder, settings)
     measures = dict(MEASURES)
     if plan.lpips:
         measures |= {f"LPIPS {name}": Lpips(name) for name in BACKBONES}
-    evaluations, shown = [], []
-    for method in methods:
-        results = [run(method, found, measures) for found in benchmarks]
-        shown += [example for _, examples in results for example in examples] if method is methods[0] else []
-        brush, seams = None, None
-        if isinstance(method, Model):
-            brush = run_control(method, benchmark, plan.views, plan.dabs)
-            seams = run_borders(method, photos) if photos else None
-        settings = method.settings if isinstance(method, Model) else None
-        tables = tuple(table for table, _ in results)
-        evaluations.append(Evaluation(method.name, settings, tables, brush, seams))
-    return evaluations, shown
+    photos = list_photos(plan.photos) if plan.photos else []
+    results = [run(method, found.first(plan.views), measures) for found in open_benchmarks(benchmark)]
+    tables = tuple(table for table, _ in results)
+    examples = [example for _, shown in results for example in shown]
+    if isinstance(method, Pictures):
+        return Evaluation(method.name, None, tables), examples
+    brush = run_control(method, benchmark, plan.views, plan.dabs)
+    seams = run_borders(method, photos) if photos else None
+    return Evaluation(method.name, method.settings, tables, brush, seams), examples
 
 
 def run(

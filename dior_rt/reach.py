@@ -1,0 +1,49 @@
+"""How far light carries from the strokes: within their reach it is the model's, beyond it the photo's."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dior_rt.errors import InputError
+from dior_rt.kernels.transfer import EPSILON
+from dior_rt.sampler import Array
+
+LEAST: Final = 1e-3  # of the picture's longer side: finer than any light grid
+
+
+def check_reach(reach: float | None) -> None:
+    """Raises InputError for a reach that is no number of at least LEAST."""
+    if reach is not None and not (math.isfinite(reach) and reach >= LEAST):
+        raise InputError(f"reach must be a number of at least {LEAST:g}, not {reach}.")
+
+
+def within_reach(source: Array, relit: Array, mask: Array, reach: float) -> Array:
+    """(relit + e) / (source + e) to the power of `closeness`, times source + e, less e: e as in `transfer`.
+
+    source, relit: (h, w, 3) linear light; mask: (h, w), above 0 where anything is drawn.
+    """
+    e = np.float32(EPSILON)
+    ratio = np.log((relit + e) / (source + e)) * closeness(mask > 0, reach)[..., None]
+    return np.maximum((source + e) * np.exp(ratio) - e, 0)  # black comes back as a rounding error
+
+
+def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:
+    """exp(-(d / reach)^2), (h, w), where d is a cell's distance to the nearest that is drawn, in longer sides
+    of the picture: 1 where drawn, 0.37 at the reach, 0 where nothing is drawn at all.
+
+    The nearest has the greatest value, and a product's greatest is found along the rows, then down.
+    """
+    falls = (_fall(size, reach * max(drawn.shape)) for size in drawn.shape)
+    down, along = falls
+    nearest = np.stack([(along * row).max(axis=1) for row in drawn])
+    return np.stack([(down * column).max(axis=1) for column in nearest.T], axis=1)
+
+
+def _fall(size: int, reach: float) -> Array:
+    """(size, size): exp(-(d / reach)^2) between all cells of a line."""
+    place = np.arange(size)
+    return np.exp(-(((place[:, None] - place) / reach) ** 2)).astype(np.float32)
