@@ -37,8 +37,7 @@ def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:
 
     The nearest has the greatest value, and a product's greatest is found along the rows, then down.
     """
-    falls = (_fall(size, reach * max(drawn.shape)) for size in drawn.shape)
-    down, along = falls
+    down, along = (_fall(size, reach * max(drawn.shape)) for size in drawn.shape)
     nearest = np.stack([(along * row).max(axis=1) for row in drawn])
     return np.stack([(down * column).max(axis=1) for column in nearest.T], axis=1)
 
