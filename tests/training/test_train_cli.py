@@ -24,31 +24,14 @@ def test_render_fit_lora_and_eval(tmp_path, monkeypatch, mini_bundle, capfd) -> 
     assert run(["train", *lora]) == 0
     assert (tmp_path / "stage2" / "lora" / "adapter_model.safetensors").is_file()
     capfd.readouterr()
-    assert (
-        run(
-            [
-                "train",
-                "eval",
-                str(mini_bundle),
-                renders,
-                "--views",
-                "1",
-                "--dabs",
-                "1",
-                "--steps",
-                "1",
-                "--json",
-            ]
-        )
-        == 0
-    )
-    own, asked = json.loads(capfd.readouterr().out)
-    assert asked["settings"]["steps"] == 1 and own["settings"]["steps"] != 1
-    assert [table["benchmark"] for table in own["tables"]] == ["replace", "change"]
+    measure = ["train", "eval", str(mini_bundle), renders, "--views", "1", "--dabs", "1"]
+    assert run([*measure, "--steps", "1", "--reach", "0.2", "--json"]) == 0
+    asked = json.loads(capfd.readouterr().out)
+    assert asked["settings"]["steps"] == 1 and asked["settings"]["reach"] == 0.2
+    assert [table["benchmark"] for table in asked["tables"]] == ["replace", "change"]
+    refused([*measure[1:], "--reach", "-1"], capfd, "reach must be a number")
     report = str(tmp_path / "report")
-    assert (
-        run(["train", "eval", str(mini_bundle), renders, "--views", "1", "--dabs", "1", "--out", report]) == 0
-    )
+    assert run([*measure, "--out", report]) == 0
     assert capfd.readouterr().out.count("replace, 1 pictures") == 1
     assert {path.name for path in (tmp_path / "report").iterdir()} == {
         "report.json",
