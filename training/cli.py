@@ -260,10 +260,10 @@ def evaluate(
     from dior_rt.training.evaluation.report import markdown, write_report
     from dior_rt.training.evaluation.run import Plan, evaluate
 
+    settings = Settings(steps, guidance, noise_scale, reach)
     if out:
         make_folder(out)  # now, rather than after the work
     plan = Plan(views, dabs, lpips, photos)
-    settings = Settings(steps, guidance, noise_scale, reach)
     evaluation, examples = evaluate(method, benchmark, settings, plan)
     if out:
         write_report(out, evaluation, examples)

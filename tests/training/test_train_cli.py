@@ -29,7 +29,8 @@ def test_render_fit_lora_and_eval(tmp_path, monkeypatch, mini_bundle, capfd) -> 
     asked = json.loads(capfd.readouterr().out)
     assert asked["settings"]["steps"] == 1 and asked["settings"]["reach"] == 0.2
     assert [table["benchmark"] for table in asked["tables"]] == ["replace", "change"]
-    refused([*measure[1:], "--reach", "-1"], capfd, "reach must be a number")
+    refused([*measure[1:], "--reach", "-1", "--out", str(tmp_path / "no")], capfd, "reach must be a number")
+    assert not (tmp_path / "no").exists()
     report = str(tmp_path / "report")
     assert run([*measure, "--out", report]) == 0
     assert capfd.readouterr().out.count("replace, 1 pictures") == 1

@@ -20,19 +20,24 @@ from dior_rt.training.evaluation.tasks import Task
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of the runtime; None takes the bundle's own, and of `reach` that the model decides."""
+    """What is asked of the runtime; None takes the bundle's own, and of `reach` that the model decides.
+
+    Raises InputError for a reach that cannot be.
+    """
 
     steps: int | None = None
     guidance: float | None = None
     noise_scale: float | None = None
     reach: float | None = None
 
+    def __post_init__(self) -> None:
+        check_reach(self.reach)
+
 
 class Model:
     """A bundle by the runtime as people run it, one seed for all pictures. settings: as used."""
 
     def __init__(self, relighter: Relighter, settings: Settings = Settings()) -> None:
-        check_reach(settings.reach)
         given = {name: value for name, value in asdict(settings).items() if value is not None}
         given.pop("reach", None)  # a bundle has none of its own
         manifest = replace(relighter.bundle.manifest, **given)
