@@ -41,6 +41,16 @@ def smooth_and_sharp(height, width):
     return photo
 
 
+def test_beyond_the_strokes_reach_the_photo_stays(relighter):
+    photo = smooth_and_sharp(90, 120)
+    strokes = np.zeros((90, 120, 4), np.float32)
+    strokes[40:50, 10:20] = 1
+    far, near = (relighter.relight(photo, strokes, reach=reach).picture.astype(int) for reach in (None, 0.1))
+    still = np.s_[:, 70:]  # four reaches from the strokes
+    assert np.abs(near[still] - photo[still]).max() <= 1 < np.abs(far[still] - photo[still]).mean()
+    assert np.abs(near[43:47, 13:17] - far[43:47, 13:17]).max() <= 1
+
+
 @pytest.mark.parametrize("size", [(384, 384), (333, 333), (256, 512), (96, 96)], ids=str)
 def test_a_photo_is_shrunk_as_diffusers_processor_does(relighter, pipes, size):
     # Shapes whose canvas has no border, so that diffusers' own rule for sizes gives the same canvas.
