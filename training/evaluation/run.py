@@ -61,12 +61,13 @@ def evaluate(
     folder: Path, benchmark: Path, settings: Settings, plan: Plan
 ) -> tuple[Evaluation, list[Example]]:
     """A bundle under these settings, or the pictures of another method. Raises what reading raises."""
+    benchmarks = open_benchmarks(benchmark)  # before what takes its time to load
     method = open_method(folder, settings)
     measures = dict(MEASURES)
     if plan.lpips:
         measures |= {f"LPIPS {name}": Lpips(name) for name in BACKBONES}
     photos = list_photos(plan.photos) if plan.photos else []
-    results = [run(method, found.first(plan.views), measures) for found in open_benchmarks(benchmark)]
+    results = [run(method, found.first(plan.views), measures) for found in benchmarks]
     tables = tuple(table for table, _ in results)
     examples = [example for _, shown in results for example in shown]
     if isinstance(method, Pictures):
