@@ -9,7 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dior_rt.training.scenes.scene import shapes
+from dior_rt.training.scenes import shapes
 from dior_rt.training.scenes.shapes import Mesh
 from dior_rt.training.scenes.textures import noise
 

@@ -14,18 +14,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dior_rt.training.scenes.scene import (
-    Camera,
-    Material,
-    Scene,
-    Source,
-    Thing,
-    Vector,
-    compound_meshes,
-    direction,
-    shapes,
-    unseen,
-)
+from dior_rt.training.scenes import compound_meshes, shapes
+from dior_rt.training.scenes.scene import Camera, Material, Scene, Source, Thing, Vector, direction, unseen
 from dior_rt.training.scenes.shapes import Mesh
 from dior_rt.training.scenes.skies import panorama
 from dior_rt.training.scenes.textures import fine_texture, relief, texture

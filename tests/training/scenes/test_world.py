@@ -10,16 +10,8 @@ from dior_rt.errors import InputError
 from dior_rt.training.data import render
 from dior_rt.training.data.render import LIT, Stage, View, lit, lumi_map, picture, reach, render_scenes, view
 from dior_rt.training.data.triplets import load_views
-from dior_rt.training.scenes.scene import (
-    Camera,
-    Material,
-    Scene,
-    Source,
-    Thing,
-    compound_meshes,
-    scene,
-    skies,
-)
+from dior_rt.training.scenes import compound_meshes, skies
+from dior_rt.training.scenes.scene import Camera, Material, Scene, Source, Thing, scene
 from dior_rt.training.scenes.shapes import box
 from dior_rt.training.scenes.textures import fine_texture, relief
 from dior_rt.training.scenes.world import world
