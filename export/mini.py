@@ -312,11 +312,9 @@ def describe(recipe: Recipe, weights: Weights) -> Manifest:
             schedule=recipe.schedule,
             steps=recipe.steps,
             guidance=recipe.guidance,
-            colour="srgb",
             grid=recipe.grid,
             noise_scale=recipe.noise_scale,
             parity={},
-            settings={},
         )
     except ValueError as error:
         raise InputError(f"The model cannot be run so: {reason(error)}.") from error

@@ -67,9 +67,7 @@ def check_operation(ops: Ops, name: str, *dtypes: np.dtype) -> None:
             raise KernelError(f"{ops.name} failed its self-test of {case.label} ({problem})") from error
         for a, b in zip(got, expected, strict=True):
             if a.shape != b.shape or a.dtype != b.dtype:
-                raise KernelError(
-                    f"{ops.name} failed its self-test of {case.label}: the result has another shape or dtype"
-                )
+                raise KernelError(f"{ops.name} failed its self-test of {case.label}: another shape or dtype")
             worst = float(np.abs(a.astype(np.float64) - b.astype(np.float64)).max())
             if not worst <= case.tolerance:  # written so that NaN fails, too
                 wrong = f"it is off by {worst:.3g} where {case.tolerance:g} is allowed"

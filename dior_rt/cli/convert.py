@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from dior_rt.cli import options
-from dior_rt.cli.extras import needs_extra
 from dior_rt.cli.text import table
 from dior_rt.errors import InputError
+from dior_rt.extras import needs_extra
 from dior_rt.files import reason
 
 if TYPE_CHECKING:

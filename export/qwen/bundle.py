@@ -27,10 +27,11 @@ from dior_rt.export.qwen.vae import write_decoder, write_encoder
 from dior_rt.export.qwen.weights import Checkpoint
 from dior_rt.families.qwen.layers import Layers
 from dior_rt.families.qwen.prompt import PromptEncoder
-from dior_rt.families.qwen.settings import FILE, LUMI_PEAK, MODULATION, PROMPTS, QwenSettings, TextSettings
+from dior_rt.families.qwen.settings import FILE, MODULATION, PROMPTS, QwenSettings, TextSettings
 from dior_rt.families.qwen.template import Prompts
 from dior_rt.flow.sampler import Array
 from dior_rt.flow.schedule import DynamicShiftSchedule, ShiftSchedule
+from dior_rt.light import LUMI_PEAK
 from dior_rt.records import unparse
 
 AREA: Final = 1024**2
@@ -248,11 +249,9 @@ class _Draft:
             schedule=self.schedule,
             steps=recipe.steps,
             guidance=recipe.guidance,
-            colour="srgb",
             grid=None,
             noise_scale=1.0,
             parity={},
-            settings={},
         )
 
     def _worst(self, figure: str, error: float) -> None:
