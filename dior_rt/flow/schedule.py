@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,15 +64,12 @@ class DynamicShiftSchedule:
         return np.append(sigma, 0.0).astype(np.float32)
 
 
-T = TypeVar("T")  # a NumPy array, a torch tensor or a float
-
-
-def shift_sigma(u: T, shift: float) -> T:
+def shift_sigma(u: Any, shift: float) -> Any:
     """Return s u / (1 + (s - 1) u): even flow time u, moved towards noise by a shift s > 1.
 
-    Training draws its sigmas with the same function.
+    u: a NumPy array, a torch tensor or a float; training draws its sigmas with the same function.
     """
-    return shift * u / (1 + (shift - 1) * u)  # type: ignore[operator]
+    return shift * u / (1 + (shift - 1) * u)
 
 
 Schedule = ShiftSchedule | DynamicShiftSchedule
