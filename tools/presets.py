@@ -6,7 +6,6 @@ python -m tools.presets --renders held-out --find     # the cheapest that keep i
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,10 +14,11 @@ import typer
 from dior_rt.bench.cases import Case, made_up
 from dior_rt.bench.promise import Kept, find, keep, settings, write_presets
 from dior_rt.bench.tables import table
-from dior_rt.errors import DiorError, InputError
+from dior_rt.errors import InputError
 from dior_rt.extras import needs_extra
 from dior_rt.presets import PROMISES, read_presets
 from dior_rt.relight import Relighter
+from tools.command import start
 
 TOLERANCES = (0.5, 1.0, 2.0, 4.0)  # of 255
 
@@ -90,8 +90,4 @@ def _cases(renders: Path | None, count: int) -> list[Case]:
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except DiorError as error:
-        typer.echo(f"dior-rt: {error}", err=True)
-        sys.exit(2)  # 1 is a broken promise
+    start(main)
