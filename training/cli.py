@@ -231,8 +231,20 @@ def synthbench(
 def evaluate(
     method: Annotated[Path, typer.Argument(help="Folder of a bundle, or of another method's pictures.")],
     benchmark: Annotated[
-        Path, typer.Argument(help="Renders that training has not seen, or SynthBench, MultiIllum, ReNe.")
+        Path,
+        typer.Argument(
+            help="Renders that training has not seen, or SynthBench, RealBench, MultiIllum, ReNe. "
+            "With --judges: the word photos, or a folder of photos, renders or pairs."
+        ),
     ],
+    judges: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Judge the model in place of the benchmark: material, objects, form, identity, slope, far, "
+            "added, ratio; separated by commas.",
+        ),
+    ] = None,
     views: Annotated[int, typer.Option(min=1, help="How many pairs of each kind at most.")] = 80,
     dabs: Annotated[int, typer.Option(min=0, help="On renders: how many views the brush visits.")] = 10,
     steps: Annotated[int | None, typer.Option(min=1, help="Of the flow [default: the bundle's own].")] = None,
@@ -255,16 +267,20 @@ def evaluate(
     Pictures of another method are called {task}.png; a name that is missing is told.
     """
     from dior_rt.files import make_folder
+    from dior_rt.training.evaluation.judges.panel import judge, parse_judges
     from dior_rt.training.evaluation.methods import Settings
     from dior_rt.training.evaluation.report import as_json as to_json
     from dior_rt.training.evaluation.report import markdown, write_report
     from dior_rt.training.evaluation.run import Plan, evaluate
 
     settings = Settings(steps, guidance, noise_scale, reach)
+    names = parse_judges(judges) if judges is not None else ()
     if out:
         make_folder(out)  # now, rather than after the work
-    plan = Plan(views, dabs, lpips, photos)
-    evaluation, examples = evaluate(method, benchmark, settings, plan)
+    if names:
+        evaluation, examples = judge(method, benchmark, names, settings, views), []
+    else:
+        evaluation, examples = evaluate(method, benchmark, settings, Plan(views, dabs, lpips, photos))
     if out:
         write_report(out, evaluation, examples)
     typer.echo(to_json(evaluation) if as_json else markdown(evaluation))
