@@ -227,6 +227,33 @@ def synthbench(
         )
 
 
+@app.command()
+def realbench(
+    views: Annotated[Path, typer.Argument(help="Folder of rendered views of the test split.")],
+    out: Annotated[Path, typer.Option(help="Folder of the benchmark; what is there already is kept.")],
+    pairs: Annotated[int, typer.Option(min=1)] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Different seeds draw different lights.")] = 0,
+) -> None:
+    """Make RealBench: pairs of held-out views with one lamp changed, added or replaced, for `eval`."""
+    from dior_rt.training.evaluation.judges.realbench import Recipe, make_realbench
+
+    with typer.progressbar(length=pairs, label="pairs") as bar:
+        make_realbench(views, out, Recipe(pairs, seed), lambda done, total: bar.update(1))
+
+
+@app.command()
+def sheet(
+    bundle: Annotated[Path, typer.Argument(help="Folder of a bundle.")],
+    out: Annotated[Path, typer.Option(help="Folder for sheet.jpg and one picture for each idea.")],
+    steps: Annotated[int | None, typer.Option(min=1, help="Of the flow [default: the bundle's own].")] = None,
+) -> None:
+    """Render the photographer's sheet: the lighting ideas of docs/sheet on real photos."""
+    from dior_rt.training.evaluation.judges.sheet import make_sheet, read_ideas
+
+    with typer.progressbar(length=len(read_ideas()), label="ideas") as bar:
+        make_sheet(bundle, out, steps, progress=lambda done, total: bar.update(1))
+
+
 @app.command(name="eval")
 def evaluate(
     method: Annotated[Path, typer.Argument(help="Folder of a bundle, or of another method's pictures.")],

@@ -50,7 +50,7 @@ class Model:
         """The photo, 8-bit or float sRGB, under the strokes; what comes back is of its dtype."""
         return np.asarray(self.relighter.relight(photo, strokes, reach=self.settings.reach).picture)
 
-    def estimate(self, photo: Photo) -> Raster:
+    def estimate(self, photo: Photo | Raster) -> Raster:
         """The photo's own light on the light grid, (h, w, 3) linear."""
         return self.relighter.estimate(photo)
 

@@ -39,7 +39,7 @@ def psnr(picture: Photo, truth: Photo) -> float:
 
 
 def scale_invariant_psnr(picture: Photo, truth: Photo) -> float:
-    """PSNR in dB after the one factor on the picture's linear light that leaves the least squared error there."""
+    """PSNR in dB after the one factor on the picture's linear light that fits the truth's best."""
     light, wanted = (srgb_to_linear(shown.astype(np.float64) / 255) for shown in (picture, truth))
     factor = float((light * wanted).sum() / max(float(np.square(light).sum()), DARK**2))
     scaled = 255 * linear_to_srgb(np.clip(light * factor, 0, 1))

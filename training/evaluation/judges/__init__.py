@@ -5,7 +5,8 @@ subjects, painting    photos with marked places; strokes for them
 changes               what a judge reads off a picture before and after
 material              does the estimated Lumi map hold the photo's colours
 objects, form         does drawn light end at an object's border; does it follow shapes
-slope, far, identity  does light follow the brush, stay near it, and leave the photo alone when it is the photo's own
+slope, far            does light follow the brush, and stay near it
+identity              does the photo's own light give the photo
 added                 one lamp added on renders
 ratio                 real pairs, driven by the true ratio of their light
 realbench             rendered pairs that training never sees, scored with the other benchmarks

@@ -19,8 +19,8 @@ from dior_rt.training.evaluation.tasks import Task
 
 SEED: Final = 4
 NOTE: Final = (
-    f"Strokes of the true map. Still: PSNR in dB where nothing is drawn and the truth differs from the photo by at "
-    f"most {SAME} of 255, all pixels together. Whole: PSNR of the picture."
+    f"Strokes of the true map. Still: PSNR in dB where nothing is drawn and the truth differs from the photo "
+    f"by at most {SAME} of 255, all pixels together. Whole: PSNR of the picture."
 )
 
 
@@ -30,12 +30,14 @@ def added(models: Sequence[Judged], folder: Path, views: int) -> Table:
     if not found:
         raise InputError(f"There are no renders in {folder}, which the judge `added` needs.")
     tasks = list(found[0].first(views))
-    rows = []
-    for model in models:
-        for blend in ("set", "add"):
-            if blend in model.blends:
-                rows.append(Row(model.name, blend, added_figures(model, tasks, blend), None))
-    return Table("added", len(tasks), NOTE, tuple(rows), None)
+    blends: tuple[Blend, ...] = ("set", "add")
+    rows = tuple(
+        Row(model.name, blend, added_figures(model, tasks, blend), None)
+        for model in models
+        for blend in blends
+        if blend in model.blends
+    )
+    return Table("added", len(tasks), NOTE, rows, None)
 
 
 def added_figures(model: Judged, tasks: Sequence[Task], blend: Blend) -> dict[str, Figure]:

@@ -19,14 +19,16 @@ DAB: Final = 1 / 6  # a dab's width, of the shorter side
 FAR: Final = 2 * DAB  # from the dab's centre, of the shorter side
 STRENGTH: Final = 3.0  # of the light that the model sees under the dab
 NOTE: Final = (
-    "Change further than two dab widths from the centre of a white dab by that under it, root mean squares, of "
-    "linear light and of its logarithm; means over photos."
+    "Change further than two dab widths from the centre of a white dab by that under it, root mean squares, "
+    "of linear light and of its logarithm; means over photos."
 )
 
 
 def far(models: Sequence[Judged], subjects: Sequence[Subject]) -> Table:
-    """Judge the models in every blend mode that they have, on the first marked object of each photo, or in its
-    middle."""
+    """Judge the models in every blend mode that they have.
+
+    The dab lies on the first marked object of each photo, or in its middle.
+    """
     rows = []
     for model in models:
         for blend in ("set", "add", "multiply"):
@@ -50,5 +52,5 @@ def far_shares(model: Judged, subject: Subject, blend: Blend) -> tuple[float, fl
     strength = (STRENGTH - 1 if blend == "add" else STRENGTH) * base
     strokes = line(shape, (at,), DAB * side, times(WHITE, strength))
     relit = model.relight(photo, strokes, blend)
-    logs = np.zeros_like(photo), log_change(photo, relit)
-    return leakage(*map(OPS.decode_srgb, (photo, relit)), under, beyond), leakage(*logs, under, beyond)
+    linear = leakage(OPS.decode_srgb(photo), OPS.decode_srgb(relit), under, beyond)
+    return linear, leakage(np.zeros_like(photo), log_change(photo, relit), under, beyond)

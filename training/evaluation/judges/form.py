@@ -1,7 +1,7 @@
 """Form: is the change of light more than a soft glow?
 
-A change of real light follows shapes: edges of shadows, orientation, occlusion. A blur of 4 % of the longer side
-keeps 0.56 of the variance of its logarithm (MultiIllum everett_kitchen2 and a statue under 12 lamps).
+A change of real light follows shapes: edges of shadows, orientation, occlusion. A blur of 4 % of the longer
+side keeps 0.56 of the variance of its logarithm (MultiIllum everett_kitchen2 and a statue under 12 lamps).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ STRENGTH: Final = 3.0  # of the light that the model sees under the stroke
 BLUR: Final = 0.04  # the Gaussian's sigma, of the longer side
 STILL: Final = 1e-10  # variance of a log change below which nothing changed
 NOTE: Final = (
-    "Variance of the log change under one white stroke that a blur of 4 % of the longer side keeps, as a share. "
-    "Changes of real light: 0.56."
+    "Variance of the log change under one white stroke that a blur of 4 % of the longer side keeps; "
+    "changes of real light: 0.56."
 )
 
 

@@ -13,7 +13,9 @@ from dior_rt.training.evaluation.results import Figure, Row, Table
 from dior_rt.training.evaluation.tasks import OPS
 
 MODES: Final[tuple[Mode, ...]] = get_args(Mode)
-NOTE: Final = "PSNR to the photo, in dB, of the model's own estimate drawn on it: strokes, coarse cells, all of it."
+NOTE: Final = (
+    "PSNR to the photo, in dB, of the model's own estimate drawn on it: strokes, coarse cells, all of it."
+)
 
 
 def identity(models: Sequence[Judged], subjects: Sequence[Subject]) -> Table:

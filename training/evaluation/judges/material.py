@@ -1,7 +1,7 @@
 """Material: does the estimated Lumi map hold the photo's own colours and patterns?
 
-Light of one colour on a scene of many colours has a Lumi map of one chroma, so the slope of the map's log chroma
-on the photo's is 0 for a map that holds no material, and 1 for the photo itself.
+Light of one colour on a scene of many colours has a Lumi map of one chroma, so the slope of the map's log
+chroma on the photo's is 0 for a map that holds no material, and 1 for the photo itself.
 """
 
 from __future__ import annotations
@@ -59,8 +59,10 @@ def log_chroma(light: Raster) -> Raster:
 
 
 def squared_correlation(one: Raster, other: Raster) -> float:
-    """Return the share of the variance of one map (h, w, C) that the best multiple of the other explains; 0 for
-    a constant map."""
+    """Return the share of the variance of one map (h, w, C) that the best multiple of the other explains.
+
+    A constant map gives 0.
+    """
     covariance, variance = _products(other, one)
     return covariance**2 / max(variance * _products(one, one)[0], 1e-12)
 

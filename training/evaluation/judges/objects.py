@@ -1,7 +1,7 @@
 """Objects: does light that is drawn on an object end at its border?
 
-A dab lies on an object. One point inside and one outside have the same distance to it, so a spread in the image
-plane changes both alike: ratio 1. Light in the scene mostly misses what lies behind.
+A dab lies on an object. One point inside and one outside have the same distance to it, so a spread in the
+image plane changes both alike: ratio 1. Light in the scene mostly misses what lies behind.
 """
 
 from __future__ import annotations
@@ -40,20 +40,21 @@ DABS: Final = {
     "dark": Dab(WHITE, 0.2, 0.05, 1.0),
 }
 NOTE: Final = (
-    "Log change outside an object by that inside, at the same distance from the dab; sums over the triples where "
-    "both points have room to change ({counts}). 1: light ignores objects."
+    "Log change outside an object by that inside, at the same distance from the dab; sums over the triples "
+    "where both points have room to change ({counts}). 1: light ignores objects."
 )
 
 
 def objects(models: Sequence[Judged], subjects: Sequence[Subject]) -> Table:
     """Judge the models by the triples of the subjects."""
     chosen = {name: usable(all_triples(subjects), dab) for name, dab in DABS.items()}
-    rows = tuple(
-        Row(model.name, "", {name: border_figure(model, chosen[name], dab) for name, dab in DABS.items()}, None)
-        for model in models
-    )
+    rows = []
+    for model in models:
+        figures = {name: border_figure(model, chosen[name], dab) for name, dab in DABS.items()}
+        if any(figure.mean for figure in figures.values()):  # a model that changes nothing has no ratio
+            rows.append(Row(model.name, "", figures, None))
     counts = ", ".join(f"{len(found)} {name}" for name, found in chosen.items())
-    return Table("objects", len(subjects), NOTE.format(counts=counts), rows, None)
+    return Table("objects", len(subjects), NOTE.format(counts=counts), tuple(rows), None)
 
 
 def usable(triples: Sequence[tuple[Subject, Triple]], dab: Dab) -> list[tuple[Subject, Triple]]:
@@ -61,7 +62,8 @@ def usable(triples: Sequence[tuple[Subject, Triple]], dab: Dab) -> list[tuple[Su
     chosen = []
     for subject, triple in triples:
         luminance = OPS.decode_srgb(subject.photo) @ LUMINANCE
-        spots = (disc(luminance.shape, at, SPOT * min(luminance.shape)) for at in (triple.inside, triple.outside))
+        radius = SPOT * min(luminance.shape)
+        spots = [disc(luminance.shape, at, radius) for at in (triple.inside, triple.outside)]
         if all(dab.darkest <= float(luminance[spot].mean()) <= dab.brightest for spot in spots):
             chosen.append((subject, triple))
     return chosen

@@ -45,9 +45,10 @@ def judge(folder: Path, subject: Path, names: Sequence[str], settings: Settings,
     on_marks = str(subject) == PHOTOS
     for name in names:
         if on_marks and name in ("added", "ratio"):
-            raise InputError(f"The judge {name} needs a folder of {'renders' if name == 'added' else 'pairs'}.")
+            kind = "renders" if name == "added" else "pairs of photos"
+            raise InputError(f"The judge {name} needs a folder of {kind} in place of the word {PHOTOS}.")
         if not on_marks and name in ON_MARKS:
-            raise InputError(f"The judge {name} works on marked photos: write `{PHOTOS}` in place of {subject}.")
+            raise InputError(f"The judge {name} needs marks. Write the word {PHOTOS} in place of {subject}.")
     photos: list[Subject] = []
     if set(names) & {"material", *ON_PHOTOS, *ON_MARKS}:
         photos = marked_photos() if on_marks else folder_photos(subject)

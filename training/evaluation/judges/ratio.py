@@ -1,7 +1,7 @@
 """Ratio strokes: real pairs, driven by the true ratio of their light.
 
-Under the strokes the control is what the light changed by, photo by photo: no estimate is asked, so it cannot leak
-the target's picture, and it is the same for every model. It is applied as `multiply`.
+Under the strokes the control is the factor by which the light changed, applied as `multiply`. No estimate is
+asked, so the control cannot leak the target's picture, and it is the same for every model.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from dior_rt.training.evaluation.tasks import OPS, Benchmark, Task
 
 SOFT: Final = 0.02  # the sigma of the blur over a stroke, of the shorter side
 MEASURES: Final = {"PSNR": psnr, "SI-PSNR": scale_invariant_psnr, "SSIM": ssim}
-NOTE: Final = "Strokes hold the true ratio of the two photos in linear light, blurred over the stroke, as `multiply`."
+NOTE: Final = (
+    "Strokes hold the true ratio of the two photos in linear light, blurred over the stroke, as `multiply`."
+)
 
 
 def ratio(models: Sequence[Judged], folder: Path, views: int) -> list[Table]:
@@ -60,7 +62,8 @@ def ratio_strokes(source: Photo, truth: Photo, seed: int) -> Strokes:
     sigma = SOFT * min(mask.shape)
     inside = gaussian_filter(mask, sigma, mode="constant")[..., None]
     soft = [
-        gaussian_filter(light * mask[..., None], (sigma, sigma, 0), mode="constant") / np.maximum(inside, 1e-6)
+        gaussian_filter(light * mask[..., None], (sigma, sigma, 0), mode="constant")
+        / np.maximum(inside, 1e-6)
         for light in (before, after)
     ]
     factor = (soft[1] + E) / (soft[0] + E)
@@ -68,11 +71,16 @@ def ratio_strokes(source: Photo, truth: Photo, seed: int) -> Strokes:
 
 
 def real_pairs(folder: Path) -> list[Benchmark]:
-    """Return the pairs of MultiIllum or ReNe, or else of a folder of scenes: FOLDER/<scene>/<photo>, or the photos
-    of one scene. Raises InputError where there are none."""
+    """Return the pairs of MultiIllum or ReNe, or else of a folder of scenes.
+
+    A scene is a folder of photos of one view; the folder may also be one scene. Raises InputError where there
+    are no pairs.
+    """
     if folder.is_dir() and (found := multi_illum(folder) or rene(folder) or scenes(folder)):
         return found
-    raise InputError(f"There are no pairs of photos in {folder}. Give a folder with a folder of photos for each scene.")
+    raise InputError(
+        f"There are no pairs of photos in {folder}. Give a folder with a folder of photos for each scene."
+    )
 
 
 def scenes(folder: Path) -> list[Benchmark]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -19,15 +20,15 @@ STRENGTHS: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # of the light that the mode
 DARKEST: Final = 0.05  # of the photo's luminance under a dab; below, the transfer's e decides
 DAB: Final = 1 / 6  # a dab's width, of the shorter side
 NOTE: Final = (
-    "Local slopes of log light under a white dab on log strength, step by step, pictures unclipped; means over dabs "
-    "({dabs}) on objects that the photo does not leave black. 1: light in proportion."
+    "Local slopes of log light under a white dab on log strength, step by step, pictures unclipped; "
+    "means over dabs ({dabs}) on objects that the photo does not leave black. 1: light in proportion."
 )
 
 
 def slope(models: Sequence[Judged], subjects: Sequence[Subject]) -> Table:
     """Judge the models by dabs on the marked objects, or in the middle of photos without marks."""
     dabs = [(subject, at) for subject in subjects for at in places(subject)]
-    names = [f"x{low:g} to x{high:g}" for low, high in zip(STRENGTHS, STRENGTHS[1:], strict=False)]
+    names = [f"x{low:g} to x{high:g}" for low, high in pairwise(STRENGTHS)]
     rows = []
     for model in models:
         slopes = np.array([local_slopes(model, subject, at) for subject, at in dabs])
@@ -37,7 +38,7 @@ def slope(models: Sequence[Judged], subjects: Sequence[Subject]) -> Table:
 
 
 def places(subject: Subject) -> list[Point]:
-    """Return where dabs go on a photo: the marked ones, or its middle; those on black surfaces are left out."""
+    """Return where dabs go on a photo: the marked places, or its middle, without black surfaces."""
     height, width = subject.photo.shape[:2]
     marked = [triple.dab for triple in subject.marks.triples] if subject.marks else [(width / 2, height / 2)]
     luminance = OPS.decode_srgb(subject.photo) @ LUMINANCE

@@ -1,8 +1,8 @@
 """Photos with marked places, and folders of photos, for judges to work on.
 
-data/photos.json names each photo as `package:path`, of an installed package, or as a path in the repository. Its
-places are pixels of the photo at `size`. A triple is a dab's centre on an object, a point inside the object and
-one outside, across its border, both at the same distance from the dab.
+data/photos.json names each photo as `package:path`, of an installed package, or as a path in the repository.
+Its places are pixels of the photo at `size`. A triple is a dab's centre on an object, a point inside the
+object and one outside, across its border, both at the same distance from the dab.
 """
 
 from __future__ import annotations
