@@ -27,16 +27,16 @@ from numpy.random import Generator
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, reason, replacing
+from dior_rt.images.photo import Photo, write_photo
+from dior_rt.images.strokes import read_lumi, write_lumi, write_strokes
 from dior_rt.kernels import Strokes
-from dior_rt.pictures import Photo, write_photo
 from dior_rt.records import parse, read_json
-from dior_rt.strokes import read_lumi, write_lumi, write_strokes
+from dior_rt.training.data.triplets import flat
 from dior_rt.training.evaluation.baselines import E
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.metrics import Raster, psnr
 from dior_rt.training.evaluation.tasks import OPS, Benchmark, Task
-from dior_rt.training.textures import rainbow
-from dior_rt.training.triplets import flat
+from dior_rt.training.scenes.textures import rainbow
 
 HEAD: Final = "realbench.json"
 LAST: Final = "target.png"  # written last: where it is, the pair is whole

@@ -20,12 +20,12 @@ from PIL import Image, ImageDraw
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, reason, replacing
+from dior_rt.images.photo import Photo as Picture
+from dior_rt.images.photo import write_photo
+from dior_rt.images.strokes import read_strokes
 from dior_rt.kernels import Stroke
-from dior_rt.pictures import Photo as Picture
-from dior_rt.pictures import write_photo
 from dior_rt.records import parse, read_json
 from dior_rt.relight import Relighter
-from dior_rt.strokes import read_strokes
 from dior_rt.training.evaluation.judges.subjects import CLONE, find_photo
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.metrics import Photo
