@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Final, Literal, Protocol
 
@@ -71,19 +72,18 @@ def on_grid(strokes: Strokes, grid: tuple[int, ...]) -> Strokes:
     return OPS.reduce_strokes(strokes.light, strokes.mask, (grid[0], grid[1]))
 
 
-@dataclass(frozen=True)
 class BundleModel:
-    """A bundle, as `Judged`."""
+    """A bundle, as `Judged`. Estimates are kept, because judges ask for those of few photos many times."""
 
-    model: Model
-    blends: frozenset[Blend] = SET_ONLY
-
-    @property
-    def name(self) -> str:
-        return self.model.name
+    def __init__(self, model: Model, blends: frozenset[Blend] = SET_ONLY) -> None:
+        self.model, self.blends, self.name = model, blends, model.name
+        self._estimates: dict[tuple[str, tuple[int, ...], bytes], Raster] = {}
 
     def estimate(self, photo: Photo | Raster) -> Raster:
-        return self.model.estimate(photo)
+        key = str(photo.dtype), photo.shape, hashlib.sha256(photo.tobytes()).digest()
+        if key not in self._estimates:
+            self._estimates[key] = self.model.estimate(photo)
+        return self._estimates[key]
 
     def relight(self, photo: Photo | Raster, strokes: Strokes, blend: Blend = "set") -> Photo:
         return self.model.relight(photo, strokes)
