@@ -87,9 +87,13 @@ def make_sheet(
 
 
 def marked(photo: Photo, drawn: list[Stroke]) -> Photo:
-    """Return the photo, darkened, with the strokes over it as the light that they hold."""
+    """Return the photo, darkened, with the strokes over it as the light that they hold.
+
+    Light brighter than display white is dimmed to it, so that its hue shows.
+    """
     strokes = OPS.draw_strokes(drawn, (photo.shape[0], photo.shape[1]))
-    shown = OPS.encode_srgb(np.clip(strokes.light, 0, 1), np.uint8).astype(np.float32)
+    light = strokes.light / np.maximum(strokes.light.max(axis=2, keepdims=True), 1)
+    shown = OPS.encode_srgb(light, np.uint8).astype(np.float32)
     mask = strokes.mask[..., None]
     return np.asarray(photo * 0.4 * (1 - mask) + shown * mask, np.uint8)
 
