@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Final, Literal
 
@@ -29,12 +29,13 @@ from dior_rt.training.blender.meshes import Finish, Mesh
 
 Split = Literal["train", "bench"]
 TILE: Final = 128
+KEPT_MODELS: Final = 150  # in memory
 BENCH_SHARES: Final = {"model": 0.12, "surface": 0.12, "person": 0.15}
 BENCH_PANORAMAS: Final = ("night", "lobby", "park", "studio")
 
 
 def split_of(kind: str, name: str) -> Split:
-    """Say whether an asset is held out for the benchmark: by its name for panoramas, by a hash for all else."""
+    """Say whether an asset is held out for the benchmark, by its name alone."""
     if kind == "panorama":
         return "bench" if name in BENCH_PANORAMAS else "train"
     share = int.from_bytes(hashlib.sha256(f"{kind}:{name}".encode()).digest()[:4], "big") / 2**32
@@ -146,7 +147,7 @@ def save_model(path: Path, mesh: Mesh) -> None:
         )
 
 
-@cache
+@lru_cache(KEPT_MODELS)
 def load_model(path: Path) -> Mesh:
     """Read what `save_model` wrote. Raises InputError."""
     try:
@@ -155,11 +156,11 @@ def load_model(path: Path) -> Mesh:
             finishes = tuple(
                 Finish(
                     **{**one, "color": tuple(one["color"])},
-                    texture=stored[f"texture{k}"] if f"texture{k}" in stored else None,
+                    texture=stored.get(f"texture{k}"),
                 )
                 for k, one in enumerate(described)
             )
-            uv = stored["uv"] if "uv" in stored else None
+            uv = stored.get("uv")
             smooth = float(stored["smooth"])
             return Mesh(stored["vertices"], stored["faces"], uv, stored["slots"], finishes, smooth)
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:

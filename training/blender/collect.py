@@ -10,8 +10,9 @@ from pathlib import Path
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, reason, replacing
-from dior_rt.training.blender.assets import Entry, save_model
+from dior_rt.training.blender.assets import Assets, Entry, save_model
 from dior_rt.training.blender.furniture import find_catalogues, models
+from dior_rt.training.blender.people import make_person
 
 COLLECTIONS = {
     "BlendSwap-CC-0": "models by various authors of blendswap.com, CC0 1.0",
@@ -27,8 +28,8 @@ def make_assets(
 ) -> list[Entry]:
     """Fill the asset folder `out`. Raises InputError where a source is missing or nothing can be written.
 
-    furniture: holds the .sh3f archives of Debian's sweethome3d-furniture (/usr/share/sweethome3d/furniture), or
-    folders of them. data: holds surfaces/ and panoramas/.
+    furniture: holds the .sh3f archives of Debian's sweethome3d-furniture
+    (/usr/share/sweethome3d/furniture), or folders of them. data: holds surfaces/ and panoramas/.
     """
     catalogues = find_catalogues(furniture)
     for part in ("surfaces", "panoramas"):
@@ -50,6 +51,20 @@ def make_assets(
     return entries
 
 
+def add_people(out: Path, count: int, progress: Callable[[str], None] = lambda name: None) -> list[Entry]:
+    """Write `count` dressed people into an asset folder. Raises InputError."""
+    assets = Assets.open(out)
+    make_folder(out / "people")
+    entries = {entry.file: entry for entry in assets.entries}
+    for seed in range(count):
+        entry, mesh = make_person(seed, assets)
+        save_model(out / entry.file, mesh)
+        entries[entry.file] = entry
+        progress(entry.file)
+    write_entries(out, list(entries.values()))
+    return list(entries.values())
+
+
 def write_entries(out: Path, entries: list[Entry]) -> None:
     """Write models.json and ATTRIBUTION.md."""
     with replacing(out / "models.json") as file:
@@ -69,6 +84,7 @@ def attribution(entries: list[Entry]) -> str:
         *(f"- {name}: {what}" for name, what in COLLECTIONS.items()),
         "",
         "Surfaces: ambientCG (CC0 1.0). Panoramas: Poly Haven (CC0 1.0).",
+        "People: MakeHuman's base mesh (CC0 1.0).",
         "",
         "| file | model | author | licence |",
         "|---|---|---|---|",

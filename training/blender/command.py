@@ -27,11 +27,16 @@ def assets(
     furniture: Annotated[
         Path, typer.Option(help="Folder with the .sh3f archives of Debian's sweethome3d-furniture.")
     ] = Path("/usr/share/sweethome3d/furniture"),
+    people: Annotated[
+        int, typer.Option(min=0, help="How many people to make (needs the package anny).")
+    ] = 200,
 ) -> None:
     """Make the asset folder that scenes are built from."""
-    from dior_rt.training.blender.collect import make_assets
+    from dior_rt.training.blender.collect import add_people, make_assets
 
     made = make_assets(out, furniture, data, lambda name: typer.echo(f"reading {name}"))
+    if people:
+        made = add_people(out, people)
     typer.echo(f"{len(made)} models in {out}")
 
 

@@ -1,9 +1,9 @@
 """Building scenes in Blender and shooting them with Cycles; the only module that imports bpy.
 
 Every light is in a light group of its own, so one pass renders the pictures of all lights. Materials carry a
-second, white matte surface that one shared value switches on: with it and without bounces, a second pass renders
-all Lumi maps. The white surface keeps cut-outs and relief; white glass lets the same share of light pass as glass
-does, but shows as white.
+second, white matte surface that one shared value switches on: with it and without bounces, a second pass
+renders all Lumi maps. The white surface keeps cut-outs and relief; white glass lets the same share of light
+pass as glass does, but shows as white.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ BOX_BLEND: Final = 0.2  # how far box projections fade into each other
 
 @dataclass(frozen=True)
 class ShootOptions:
-    """resolution: side in pixels. samples, lumi_samples: a pixel, shared by all lights. bounces: of light after
-    the first surface. threads: of Cycles. seed: of its noise."""
+    """resolution: side in pixels. samples, lumi_samples: a pixel, shared by all lights. bounces: of light
+    after the first surface. threads: of Cycles. seed: of its noise."""
 
     resolution: int = 128
     samples: int = 40
@@ -51,8 +51,8 @@ class ShootOptions:
 class Shot:
     """One view's rasters, with noise, in any strength of the lights; names as in `store`.
 
-    images, lumi: (K, H, W, 3), the world last. guide_albedo, guide_normals: for the denoiser. normals: (H, W, 3)
-    in the scene's space.
+    images, lumi: (K, H, W, 3), the world last. guide_albedo, guide_normals: for the denoiser. normals: (H,
+    W, 3) in the scene's space.
     """
 
     images: Raster
@@ -99,9 +99,7 @@ class Studio:
     def cast(self, origin: NDArray[np.float64], directions: NDArray[np.float64], reach: float = 1e6) -> Hits:
         """What rays from a point hit within `reach`."""
         start = Vector(origin)
-        found = [
-            self._scene.ray_cast(self._graph, start, Vector(way), distance=reach) for way in directions
-        ]
+        found = [self._scene.ray_cast(self._graph, start, Vector(way), distance=reach) for way in directions]
         return Hits(
             hit=np.array([one[0] for one in found]),
             at=np.array([one[1] for one in found], float),
@@ -288,8 +286,11 @@ def _material(finish: Finish, paper: Any) -> Any:
 def _surface(nodes: _Nodes, finish: Finish, color: Any, relief: Any) -> Any:
     body = nodes.add("ShaderNodeBsdfPrincipled")
     for name, value in (
-        ("Base Color", color), ("Roughness", finish.roughness), ("Metallic", finish.metallic), ("Normal", relief),
-    ):  # fmt: skip
+        ("Base Color", color),
+        ("Roughness", finish.roughness),
+        ("Metallic", finish.metallic),
+        ("Normal", relief),
+    ):
         nodes.set(body.inputs[name], value)
     if not finish.glass:
         return body
@@ -327,7 +328,9 @@ def _world(scene: Any, panorama: Panorama, file: Path) -> Any:
     world.use_nodes = True
     world.lightgroup = WORLD
     nodes = _Nodes(world.node_tree)
-    picture = nodes.add("ShaderNodeTexEnvironment", image=bpy.data.images.load(str(file), check_existing=True))
+    picture = nodes.add(
+        "ShaderNodeTexEnvironment", image=bpy.data.images.load(str(file), check_existing=True)
+    )
     turned = nodes.add("ShaderNodeMapping")
     nodes.set(turned.inputs["Vector"], nodes.add("ShaderNodeTexCoord").outputs["Generated"])
     nodes.set(turned.inputs["Rotation"], (0, 0, panorama.turn))

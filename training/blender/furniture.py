@@ -168,7 +168,7 @@ def _read_mesh(catalogue: Catalogue, path: str) -> Mesh:
             corners += fan
             slots += [slot] * len(fan)
     at = np.array(vertices, float)
-    pairs = [[(corner.split("/") + ["", ""])[:2] for corner in face] for face in corners]
+    pairs = [[[*corner.split("/"), "", ""][:2] for corner in face] for face in corners]
     faces = _indices([[corner[0] for corner in face] for face in pairs], len(at))
     uv = None
     if texels and all(corner[1] for face in pairs for corner in face):
@@ -240,7 +240,12 @@ def _turned(mesh: Mesh, rotation: str | None) -> Mesh:
     to_upright = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
     turn = to_upright @ np.array(rotation.split(), float).reshape(3, 3) @ to_upright.T
     return Mesh(
-        (mesh.vertices @ turn.T).astype(np.float32), mesh.faces, mesh.uv, mesh.slots, mesh.finishes, mesh.smooth
+        (mesh.vertices @ turn.T).astype(np.float32),
+        mesh.faces,
+        mesh.uv,
+        mesh.slots,
+        mesh.finishes,
+        mesh.smooth,
     )
 
 

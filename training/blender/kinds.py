@@ -10,11 +10,17 @@ import numpy as np
 from dior_rt.training.blender.assets import Assets, Split
 from dior_rt.training.blender.outdoors import outdoor
 from dior_rt.training.blender.placing import Stock
+from dior_rt.training.blender.portraits import portrait
 from dior_rt.training.blender.rooms import room
 from dior_rt.training.blender.scene import BlenderScene, Panorama
 from dior_rt.training.blender.tables import table
 
-KINDS: Final = {"room": (room, 0.4), "table": (table, 0.35), "outdoor": (outdoor, 0.25)}
+KINDS: Final = {
+    "room": (room, 0.3),
+    "table": (table, 0.25),
+    "outdoor": (outdoor, 0.2),
+    "portrait": (portrait, 0.25),
+}
 OPEN_AIR: Final = (
     "bridge", "city", "dawn", "esplanade", "forest", "night", "park", "sky", "sunrise", "sunset", "venice",
 )  # fmt: skip

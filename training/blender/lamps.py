@@ -1,4 +1,4 @@
-"""Lamps for a view: seven beside the panorama, a third of them near surfaces, placed where they light something."""
+"""Lamps for a view: seven beside the panorama, three of them near surfaces; each lights something seen."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from dior_rt.training.blender.meshes import triple
 from dior_rt.training.blender.probe import Hits, Stage
 from dior_rt.training.blender.scene import BlenderScene, Camera, Gobo, GoboKind, Lamp, Vector
 
@@ -78,7 +79,14 @@ def torch(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> La
     way = normal + rng.normal(0, 0.5, 3) + [0, 0, 0.3]
     at = point + way / np.linalg.norm(way) * scene.span * rng.uniform(0.4, 1.0)
     return _lamp(
-        scene, "spot", at, point, rng.uniform(0.005, 0.03) * scene.span, "torch", rng, cone=rng.uniform(18, 50)
+        scene,
+        "spot",
+        at,
+        point,
+        rng.uniform(0.005, 0.03) * scene.span,
+        "torch",
+        rng,
+        cone=rng.uniform(18, 50),
     )
 
 
@@ -111,8 +119,7 @@ def sun(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp
     """Parallel light with hard shadows."""
     middle = _middle(scene, hits)
     way = _around(camera, middle, rng, (0.2, 2.4), (0.15, 1.3))
-    at = tuple(map(float, middle + 10 * way))
-    return Lamp("sun", at, tuple(map(float, middle)), float(rng.uniform(0.3, 4)), "sun")
+    return Lamp("sun", triple(middle + 10 * way), triple(middle), float(rng.uniform(0.3, 4)), "sun")
 
 
 def top(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
@@ -160,11 +167,13 @@ def _lamp(
     """The lamp where it is free to stand, at times behind a gobo."""
     if not scene.free(np.asarray(at), margin=max(0.02, size if kind == "point" else 0.0)):
         return None
-    gobo = _gobo(rng) if kind in ("point", "spot") and role != "candle" and rng.random() < GOBO_SHARE else None
+    gobo = (
+        _gobo(rng) if kind in ("point", "spot") and role != "candle" and rng.random() < GOBO_SHARE else None
+    )
     return Lamp(
         kind,  # type: ignore[arg-type]
-        tuple(map(float, at)),
-        tuple(map(float, target)),
+        triple(at),
+        triple(target),
         float(size if gobo is None else min(size, 0.01)),
         role,
         float(cone),
@@ -176,6 +185,11 @@ def _lamp(
 def _gobo(rng: Generator) -> Gobo:
     kinds: tuple[GoboKind, ...] = ("flag", "flag", "slats", "window", "leaves")
     kind = kinds[rng.integers(5)]
-    size = {"flag": 1.0, "slats": rng.uniform(0.06, 0.25), "window": rng.uniform(0.2, 0.5), "leaves": rng.uniform(0.1, 0.4)}
+    size = {
+        "flag": 1.0,
+        "slats": rng.uniform(0.06, 0.25),
+        "window": rng.uniform(0.2, 0.5),
+        "leaves": rng.uniform(0.1, 0.4),
+    }
     soft = rng.uniform(0.02, 0.3)
     return Gobo(kind, float(size[kind]), float(rng.uniform(0, 6.28)), float(rng.normal(0, 0.08)), float(soft))

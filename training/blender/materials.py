@@ -9,24 +9,46 @@ from typing import Final
 from numpy.random import Generator
 
 from dior_rt.training.blender.assets import Assets, Split
-from dior_rt.training.blender.meshes import Finish, Mesh
+from dior_rt.training.blender.meshes import Finish, Mesh, triple
 
 FLOORS: Final = (
-    "WoodFloor", "Planks", "Tiles", "Carpet", "Concrete", "Marble", "Terrazzo", "Tatami", "Granite", "Travertine",
-    "Wood", "Fabric", "Cork",
+    "WoodFloor", "Planks", "Tiles", "Carpet", "Concrete", "Marble", "Terrazzo", "Tatami", "Granite",
+    "Travertine", "Wood", "Fabric", "Cork",
 )  # fmt: skip
 WALLS: Final = (
-    "Wallpaper", "Plaster", "Paint", "Bricks", "Concrete", "WoodSiding", "Tiles", "Planks", "Fabric", "Marble",
-    "Paper", "Clay",
+    "Wallpaper", "Plaster", "Paint", "Bricks", "Concrete", "WoodSiding", "Tiles", "Planks", "Fabric",
+    "Marble", "Paper", "Clay",
 )  # fmt: skip
 GROUNDS: Final = (
-    "Grass", "Ground", "Gravel", "PavingStones", "Asphalt", "Road", "Snow", "Moss", "Rocks", "ScatteredLeaves",
-    "Concrete", "Bricks", "WoodChips",
+    "Grass", "Ground", "Gravel", "PavingStones", "Asphalt", "Road", "Snow", "Moss", "Rocks",
+    "ScatteredLeaves", "Concrete", "Bricks", "WoodChips",
 )  # fmt: skip
 FACADES: Final = ("Bricks", "Concrete", "WoodSiding", "Plaster", "Planks", "Rock", "PavingStones")
-TABLE_TOPS: Final = ("Wood", "WoodFloor", "Marble", "Planks", "Granite", "Fabric", "Terrazzo", "Plastic", "Cork", "Paper")
+TABLE_TOPS: Final = (
+    "Wood",
+    "WoodFloor",
+    "Marble",
+    "Planks",
+    "Granite",
+    "Fabric",
+    "Terrazzo",
+    "Plastic",
+    "Cork",
+    "Paper",
+)
 METALS: Final = ("Metal", "DiamondPlate", "CorrugatedSteel", "Foil", "Chainmail")
-SOFT: Final = ("Fabric", "Carpet", "Grass", "Moss", "Snow", "Paper", "Cardboard", "Cork", "Tatami", "ThatchedRoof")
+SOFT: Final = (
+    "Fabric",
+    "Carpet",
+    "Grass",
+    "Moss",
+    "Snow",
+    "Paper",
+    "Cardboard",
+    "Cork",
+    "Tatami",
+    "ThatchedRoof",
+)
 
 
 def tile(rng: Generator, assets: Assets, split: Split, repeats: float, *kinds: str) -> Finish:
@@ -35,10 +57,12 @@ def tile(rng: Generator, assets: Assets, split: Split, repeats: float, *kinds: s
     index = chosen[rng.integers(len(chosen))]
     kind = assets.kinds[index]
     metal = kind in METALS
-    rough = rng.uniform(0.7, 1) if kind in SOFT else rng.uniform(0.15, 0.5) if metal else rng.uniform(0.2, 0.95)
+    rough = (
+        rng.uniform(0.7, 1) if kind in SOFT else rng.uniform(0.15, 0.5) if metal else rng.uniform(0.2, 0.95)
+    )
     tint = rng.uniform(0.75, 1.15) * (1 + rng.normal(0, 0.05, 3))
     return Finish(
-        color=tuple(float(v) for v in tint.clip(0.3, 1.25)),
+        color=triple(tint.clip(0.3, 1.25)),
         texture=assets.tile(index),
         box=float(repeats * rng.uniform(0.7, 1.4)),
         roughness=float(rough),
@@ -51,7 +75,10 @@ def paint(rng: Generator) -> Finish:
     """Plain paint: mostly near-neutral, at times of a colour, seldom dark."""
     if rng.random() < 0.65:
         value = rng.uniform(0.3, 0.85) if rng.random() < 0.85 else rng.uniform(0.03, 0.3)
-        hue, saturation = rng.uniform(0.02, 0.17) if rng.random() < 0.7 else rng.random(), rng.uniform(0, 0.25)
+        hue, saturation = (
+            rng.uniform(0.02, 0.17) if rng.random() < 0.7 else rng.random(),
+            rng.uniform(0, 0.25),
+        )
     else:
         hue, saturation, value = rng.random(), rng.uniform(0.25, 0.85), rng.uniform(0.15, 0.8)
     color = colorsys.hsv_to_rgb(hue, saturation, value)
@@ -68,7 +95,9 @@ def glass(rng: Generator) -> Finish:
     """Clear or lightly coloured glass with a sharp reflection."""
     tint = 1 - rng.uniform(0, 0.3, 3) * (rng.random() < 0.4)
     return Finish(
-        color=tuple(float(v) for v in tint), roughness=float(rng.uniform(0.02, 0.12)), glass=float(rng.uniform(0.6, 0.92))
+        color=triple(tint),
+        roughness=float(rng.uniform(0.02, 0.12)),
+        glass=float(rng.uniform(0.6, 0.92)),
     )
 
 
@@ -92,7 +121,7 @@ def repainted(rng: Generator, mesh: Mesh) -> Mesh:
     changed = tuple(
         replace(
             finish,
-            color=tuple(float(v) for v in (tint * finish.color).clip(0.02, 1.2)),
+            color=triple((tint * finish.color).clip(0.02, 1.2)),
             roughness=float(min(max(finish.roughness * gloss, 0.05), 1)),
         )
         for finish, tint in zip(mesh.finishes, tints, strict=True)

@@ -6,19 +6,26 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float32]
+Triple = tuple[float, float, float]
+
+
+def triple(values: ArrayLike) -> Triple:
+    """Three numbers as plain floats."""
+    x, y, z = np.asarray(values, float).tolist()
+    return x, y, z
 
 
 @dataclass(frozen=True)
 class Finish:
     """How a surface reflects.
 
-    color: linear RGB, a factor on the texture where there is one. texture: (h, w, 3 or 4) uint8 sRGB, row 0 on
-    top; a fourth channel cuts out. box: the texture is projected along the axes at `box` repeats a metre; 0
-    uses the mesh's uv. glass: the share of light that passes straight through. bump: strength of a relief made
-    from the texture.
+    color: linear RGB, a factor on the texture where there is one. texture: (h, w, 3 or 4) uint8 sRGB, row 0
+    on top; a fourth channel cuts out. box: the texture is projected along the axes at `box` repeats a
+    metre; 0 uses the mesh's uv. glass: the share of light that passes straight through. bump: strength of a
+    relief made from the texture.
     """
 
     color: tuple[float, float, float] = (0.6, 0.6, 0.6)
@@ -32,7 +39,8 @@ class Finish:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """vertices: (N, 3). faces: (M, 3) indices. uv: (M, 3, 2) a corner, or None. slots: (M,) index into finishes.
+    """vertices: (N, 3). faces: (M, 3) indices. uv: (M, 3, 2) a corner, or None. slots: (M,) index into
+    finishes.
 
     smooth: the angle in degrees below which neighbouring faces share their shading.
     """

@@ -23,7 +23,11 @@ def outdoor(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderS
     extent = float(np.max(subject.mesh.size) * subject.scale)
     near = subject.at[:2]
     for _ in range(int(rng.integers(1, 7))):
-        entry = stock.entry("outdoor", "animal", "person", "vehicle") if rng.random() < 0.75 else stock.entry("floor")
+        entry = (
+            stock.entry("outdoor", "animal", "person", "vehicle")
+            if rng.random() < 0.75
+            else stock.entry("floor")
+        )
         if entry is None:
             continue
         mesh = stock.model(entry)
@@ -76,8 +80,6 @@ def _fence(stock: Stock, things: list[Thing], subject: Thing) -> None:
     finish = metal(rng) if rng.random() < 0.4 else paint(rng)
     step, tall, wide = rng.uniform(0.12, 0.5), rng.uniform(0.6, 1.6), rng.uniform(0.015, 0.08)
     back = subject.at[1] + rng.uniform(0.5, 2.5) + float(subject.mesh.size.max()) * subject.scale * 0.5
-    posts = [
-        meshes.moved(meshes.box((wide, wide, tall)), (x, 0, 0)) for x in np.arange(-5, 5, step)
-    ]
+    posts = [meshes.moved(meshes.box((wide, wide, tall)), (x, 0, 0)) for x in np.arange(-5, 5, step)]
     rails = [meshes.moved(meshes.box((10, wide * 0.6, wide)), (0, 0, tall * share)) for share in (0.25, 0.85)]
     put(things, meshes.join([*posts, *rails]).finished(finish), subject.at[0], back)

@@ -23,13 +23,19 @@ class Floor:
     high: tuple[float, float]
     taken: list[tuple[float, float, float]] = field(default_factory=list)
 
-    def spot(self, rng: Generator, radius: float, near: tuple[float, float] | None = None) -> tuple[float, float] | None:
+    def spot(
+        self, rng: Generator, radius: float, near: tuple[float, float] | None = None
+    ) -> tuple[float, float] | None:
         """A free place for a disc, or None after some tries. near: a place to stay about."""
         low, high = np.array(self.low) + radius, np.array(self.high) - radius
         if np.any(low > high):
             return None
         for _ in range(20):
-            at = rng.uniform(low, high) if near is None else rng.normal(near, 2.2 * radius + 0.15).clip(low, high)
+            at = (
+                rng.uniform(low, high)
+                if near is None
+                else rng.normal(near, 2.2 * radius + 0.15).clip(low, high)
+            )
             if all(math.dist(at, (x, y)) > 0.85 * (radius + r) for x, y, r in self.taken):
                 self.taken.append((float(at[0]), float(at[1]), radius))
                 return float(at[0]), float(at[1])
@@ -83,19 +89,29 @@ class Stock:
     def vessel(self, height: float) -> Mesh:
         """Glass, metal or glazed ware."""
         rng = self.rng
-        finish = glass(rng) if rng.random() < 0.45 else metal(rng) if rng.random() < 0.4 else replace(paint(rng), roughness=0.12)
+        finish = (
+            glass(rng)
+            if rng.random() < 0.45
+            else metal(rng)
+            if rng.random() < 0.4
+            else replace(paint(rng), roughness=0.12)
+        )
         return meshes.vessel(height, rng).finished(finish)
 
     def flower(self, height: float) -> Mesh:
         """Thin leaves."""
         green = self.rng.uniform(0.6, 1.4)
-        color = (0.08 * green, 0.2 * green, 0.05 * green) if self.rng.random() < 0.8 else (0.4, 0.15 * green, 0.12)
+        color = (
+            (0.08 * green, 0.2 * green, 0.05 * green)
+            if self.rng.random() < 0.8
+            else (0.4, 0.15 * green, 0.12)
+        )
         return meshes.leaves(height, self.rng).finished(meshes.Finish(color=color, roughness=0.5))
 
     def wire(self, height: float) -> Mesh:
         """Thin bent wire standing up."""
         t = np.linspace(0, 1, 40)
-        a, b, turns = self.rng.uniform(0.05, 0.4, 2).tolist() + [self.rng.uniform(0.3, 3)]
+        a, b, turns = self.rng.uniform([0.05, 0.05, 0.3], [0.4, 0.4, 3])
         angle = 6.28 * turns * t
         path = np.stack([a * height * np.cos(angle), b * height * np.sin(angle), height * t], -1)
         return meshes.tube(path, height * self.rng.uniform(0.008, 0.03)).finished(metal(self.rng))
@@ -114,7 +130,14 @@ def radius_of(mesh: Mesh, scale: float = 1.0) -> float:
 
 
 def put(
-    things: list[Thing], mesh: Mesh, x: float, y: float, z: float = 0.0, turn: float = 0.0, scale: float = 1.0, role: Role = "thing"
+    things: list[Thing],
+    mesh: Mesh,
+    x: float,
+    y: float,
+    z: float = 0.0,
+    turn: float = 0.0,
+    scale: float = 1.0,
+    role: Role = "thing",
 ) -> Thing:
     """Stand a mesh at a place, add it to the things, and return it."""
     thing = Thing(mesh, (x, y, z), turn, scale, role=role)
@@ -122,6 +145,11 @@ def put(
     return thing
 
 
-def shell(things: list[Thing], size: tuple[float, float, float], low: tuple[float, float, float], finish: meshes.Finish) -> None:
+def shell(
+    things: list[Thing],
+    size: tuple[float, float, float],
+    low: tuple[float, float, float],
+    finish: meshes.Finish,
+) -> None:
     """Add a box of the shell: ground, wall or ceiling. low: the middle of its lower face."""
     things.append(Thing(meshes.box(size).finished(finish), low, role="shell"))

@@ -40,8 +40,8 @@ def look(stage: Stage, camera: Camera) -> Hits:
 def score(scene: BlenderScene, camera: Camera, hits: Hits) -> float:
     """Judge a composition; above 0 it is a picture worth taking, and more is better.
 
-    Wanted: the subject takes 6 to 60 % of the frame and not only its rim; no single thing of the shell fills it;
-    nothing stands right before the lens; more than one depth and one orientation.
+    Wanted: the subject takes 6 to 60 % of the frame and not only its rim; no single thing of the shell
+    fills it; nothing stands right before the lens; more than one depth and one orientation.
     """
     roles = np.array([thing.role for thing in scene.things])
     seen = roles[np.maximum(hits.thing, 0)]
@@ -60,4 +60,6 @@ def score(scene: BlenderScene, camera: Camera, hits: Hits) -> float:
     off = max(abs(rows.mean() / SIDE - 0.5), abs(columns.mean() / SIDE - 0.5))
     others = len(np.unique(hits.thing[hits.hit & ~shell]))
     filled = 1 - abs(share - 0.25) * 1.5
-    return float(max(filled + 0.08 * min(others, 5) - 1.2 * max(off - 0.15, 0) - 1.0 * max(flat - 0.45, 0), 0.01))
+    return float(
+        max(filled + 0.08 * min(others, 5) - 1.2 * max(off - 0.15, 0) - 1.0 * max(flat - 0.45, 0), 0.01)
+    )

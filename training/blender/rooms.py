@@ -32,7 +32,10 @@ def room(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderScen
         if spot := floor.spot(rng, radius_of(mesh, scale)):
             put(things, mesh, *spot, turn=rng.uniform(0, 6.28), scale=scale)
     low, high = subject.corners().min(0), subject.corners().max(0)
-    room_low, room_high = np.array([-width / 2, -depth / 2 - 3.0, 0.0]), np.array([width / 2, depth / 2, height])
+    room_low, room_high = (
+        np.array([-width / 2, -depth / 2 - 3.0, 0.0]),
+        np.array([width / 2, depth / 2, height]),
+    )
     cameras = around(rng, low, high, views, facing=-math.pi / 2, spread=0.9, room=(room_low, room_high))
     span = float(np.clip(np.max(high - low) * 1.6, 0.8, 2.5))
     return BlenderScene(
@@ -79,7 +82,9 @@ def pierced(
     middle = float(np.clip(near + rng.uniform(-0.8, 0.8), -reach, reach))
     c, s = math.cos(turn), math.sin(turn)
 
-    def part(size: tuple[float, float, float], along: float, z: float, look: meshes.Finish, depth: float = 0.0) -> None:
+    def part(
+        size: tuple[float, float, float], along: float, z: float, look: meshes.Finish, depth: float = 0.0
+    ) -> None:
         place = (at[0] + c * along - s * depth, at[1] + s * along + c * depth, z)
         things.append(Thing(meshes.box(size).finished(look), place, turn, role="shell"))
 
@@ -121,7 +126,11 @@ def _furniture(stock: Stock, things: list[Thing], floor: Floor, width: float, de
         gap = entry.size[1] / 2 + 0.04
         turn = (0.0, math.pi / 2, -math.pi / 2)[side]
         along = rng.uniform(-0.4, 0.4)
-        at = ((along * width, depth / 2 - gap), (-width / 2 + gap, along * depth), (width / 2 - gap, along * depth))[side]
+        at = (
+            (along * width, depth / 2 - gap),
+            (-width / 2 + gap, along * depth),
+            (width / 2 - gap, along * depth),
+        )[side]
         if any(math.dist(at, (x, y)) < 0.85 * (radius + r) for x, y, r in floor.taken):
             return
         floor.taken.append((*at, radius))
@@ -158,7 +167,7 @@ def _on_walls(stock: Stock, things: list[Thing], width: float, depth: float, hei
         x, z = rng.uniform(-width / 2 + 0.7, width / 2 - 0.7), rng.uniform(0.9, max(1.0, height - h - 0.3))
         put(things, meshes.box((w, 0.03, h)).finished(stock.tile(1 / max(w, h))), x, y, z)
     if rng.random() < 0.25:
-        mesh = meshes.cloth(rng.uniform(0.5, 1.4), height - 0.1, rng).finished(stock.paint_or_tile(1.5, "Fabric"))
+        mesh = meshes.cloth(rng.uniform(0.5, 1.4), height - 0.1, rng).finished(
+            stock.paint_or_tile(1.5, "Fabric")
+        )
         put(things, mesh, rng.uniform(-width / 3, width / 3), y - 0.12, 0.02)
-
-

@@ -1,6 +1,7 @@
 """What a scene is: things, a panorama around them, cameras to choose from; and the lamps that views add.
 
-Everything is plain data in metres, z up. A scene's things stand where the description says; `cycles` builds it.
+Everything is plain data in metres, z up. A scene's things stand where the description says; `cycles` builds
+it.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class Camera:
         return np.stack([c * right + s * up, c * up - s * right, back])
 
     def rays(self, side: int) -> Vector:
-        """(side * side, 3) unit directions through a grid of the picture's pixels, row by row from the top."""
+        """(side * side, 3) unit directions through a grid of the picture, row by row from the top."""
         reach = math.tan(math.radians(self.fov / 2))
         steps = (np.arange(side) + 0.5) / side * 2 - 1
         x, y = np.meshgrid(steps * reach, -steps * reach)
@@ -93,8 +94,9 @@ class Camera:
 class Gobo:
     """A pattern before a lamp that lets light through in some directions.
 
-    kind: "flag" half plane, "slats" a blind, "window" panes, "leaves" spots. size: of the pattern, as the tangent
-    of an angle. turn: in radians. shift: of the pattern. soft: width of its edges, as a share of its size.
+    kind: "flag" half plane, "slats" a blind, "window" panes, "leaves" spots. size: of the pattern, as the
+    tangent of an angle. turn: in radians. shift: of the pattern. soft: width of its edges, as a share of
+    its size.
     """
 
     kind: GoboKind

@@ -42,8 +42,9 @@ Half = NDArray[np.float16]
 class ViewHead:
     """What a view's file says in words.
 
-    lights: one object a light, in the order of the images: kind, role, gobo; kind "world" comes last. roles: of
-    the things, in the order of their ids. camera: at, fov in degrees, axes (rows right, up, backward).
+    lights: one object a light, in the order of the images: kind, role, gobo; kind "world" comes last.
+    roles: of the things, in the order of their ids. camera: at, fov in degrees, axes (rows right, up,
+    backward).
     """
 
     seed: int
@@ -96,7 +97,7 @@ def load_view(path: Path) -> View:
                 raise ValueError("another version made it")
             head = ViewHead(**described)
             head = ViewHead(**{**described, "lights": tuple(head.lights), "roles": tuple(head.roles)})
-            world = stored["world_lumi"] if "world_lumi" in stored else None
+            world = stored.get("world_lumi")
             arrays = {name: stored[name] for name in ARRAYS}
             if len(arrays["images"]) != len(arrays["lumi"]) + (world is not None):
                 raise ValueError("pictures and Lumi maps differ in number")

@@ -21,8 +21,8 @@ def table(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderSce
     tray = Floor((-0.8, -0.5), (0.8, 0.6))
     hero = rng.uniform(0.2, 0.5)
     mesh, scale = _hero(stock, hero)
-    spot = tray.spot(rng, radius_of(mesh, scale), near=(0, 0)) or (0.0, 0.0)
-    subject = put(things, mesh, *spot, turn=rng.uniform(0, 6.28), scale=scale, role="subject")
+    foot = tray.spot(rng, radius_of(mesh, scale), near=(0, 0)) or (0.0, 0.0)
+    subject = put(things, mesh, *foot, turn=rng.uniform(0, 6.28), scale=scale, role="subject")
     for _ in range(int(rng.integers(0, 7))):
         mesh, scale = stock.small(hero * rng.uniform(0.35, 1.1))
         if spot := tray.spot(rng, radius_of(mesh, scale), near=subject.at[:2]):
@@ -58,7 +58,9 @@ def _ground(stock: Stock, things: list[Thing]) -> None:
         z = np.concatenate([[0, 0], radius * (1 - np.cos(turn)), [3.0]])
         x = np.array([-4.0, 4.0])[:, None]
         points = np.stack(np.broadcast_arrays(x, y, z), -1)
-        mesh = meshes.grid(points).finished(paint(rng) if rng.random() < 0.8 else stock.tile(1, "Paper", "Fabric"))
+        mesh = meshes.grid(points).finished(
+            paint(rng) if rng.random() < 0.8 else stock.tile(1, "Paper", "Fabric")
+        )
         things.append(Thing(mesh, (0, 0, 0), role="shell"))
         return
     size = (rng.uniform(1.2, 2.5), rng.uniform(1.0, 1.6)) if pick < 0.65 else (5.0, 5.0)

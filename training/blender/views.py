@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from dior_rt.training.blender.scene import BlenderScene, Camera, Lamp
 from dior_rt.training.blender.store import MEAN_LUMI, View, ViewHead, half, save_view
 
 if TYPE_CHECKING:
-    from dior_rt.training.blender.cycles import Shot, ShootOptions, Studio
+    from dior_rt.training.blender.cycles import ShootOptions, Shot, Studio
 
 RENDERER: Final = "blender-1"
 VIEWS: Final = 2  # a scene
@@ -57,8 +56,8 @@ def render_views(
 ) -> None:
     """Render the scenes that are not there yet to `out/<split>-<seed>-<view>.npz`, VIEWS files each.
 
-    A scene without a picture worth taking leaves an empty file `<split>-<seed>.none`, so that a later run does
-    not try again. Raises InputError where the assets cannot be read or nothing can be written.
+    A scene without a picture worth taking leaves an empty file `<split>-<seed>.done`, so that a later run
+    does not try again. Raises InputError where the assets cannot be read or nothing can be written.
     """
     from dior_rt.training.blender.cycles import Studio
 
@@ -111,7 +110,12 @@ def finish(
 ) -> View | None:
     """Denoise a shot and keep the lights that reach enough of it; None where too few do."""
     seen = shot.sky < 0.5
-    lights = [*({"kind": l.kind, "role": l.role, "gobo": l.gobo.kind if l.gobo else None} for l in chosen)]
+    lights = [
+        *(
+            {"kind": lamp.kind, "role": lamp.role, "gobo": lamp.gobo.kind if lamp.gobo else None}
+            for lamp in chosen
+        )
+    ]
     lights += [{"kind": "world", "role": "world", "gobo": None}] * (len(shot.lumi) - len(chosen))
     images, maps, kept = [], [], []
     white = np.repeat((1 - shot.sky)[..., None], 3, axis=2)
