@@ -282,10 +282,13 @@ def _pieces(
     """Skin, clothes, shoes and hair, cut from the figure at rest."""
     names = list(BONES)
     strong = {name: figure.weights[:, names.index(name)] for name in names}
-    arms = sum(strong[f"lowerarm01.{s}"] + strong[f"wrist.{s}"] for s in "LR")
-    upper_arms = sum(strong[f"upperarm01.{s}"] for s in "LR")
-    shins = sum(strong[f"lowerleg01.{s}"] + strong[f"foot.{s}"] for s in "LR")
-    feet = sum(strong[f"foot.{s}"] for s in "LR")
+
+    def share(*bones: str) -> Array:
+        """By vertex, how much it moves with some bones of both sides."""
+        return np.sum([strong[f"{bone}.{side}"] for bone in bones for side in "LR"], axis=0)
+
+    arms, upper_arms = share("lowerarm01", "wrist"), share("upperarm01")
+    shins, feet = share("lowerleg01", "foot"), share("foot")
     waist = shape[figure.joints["joint-pelvis"], 1].mean()
     neck = shape[figure.joints["joint-neck"], 1].mean()
     height = shape[:, 1]

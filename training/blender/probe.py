@@ -57,9 +57,9 @@ def score(scene: BlenderScene, camera: Camera, hits: Hits) -> float:
     if close.mean() > 0.2 or flat > 0.72:
         return -1.0
     rows, columns = np.divmod(np.flatnonzero(subject), SIDE)
+    cropped = subject[:SIDE].mean()  # along the picture's upper edge
     off = max(abs(rows.mean() / SIDE - 0.5), abs(columns.mean() / SIDE - 0.5))
     others = len(np.unique(hits.thing[hits.hit & ~shell]))
-    filled = 1 - abs(share - 0.25) * 1.5
-    return float(
-        max(filled + 0.08 * min(others, 5) - 1.2 * max(off - 0.15, 0) - 1.0 * max(flat - 0.45, 0), 0.01)
-    )
+    filled = 1 - 1.5 * abs(share - 0.25)
+    value = filled + 0.08 * min(others, 5) - 1.2 * max(off - 0.15, 0) - max(flat - 0.45, 0) - 0.6 * cropped
+    return float(max(value, 0.01))
