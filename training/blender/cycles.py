@@ -9,8 +9,11 @@ pass as glass does, but shows as white.
 from __future__ import annotations
 
 import math
+import os
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -159,8 +162,23 @@ class Studio:
         self._scene.render.film_transparent = paper
         path = Path(self._files.name) / f"{name}.exr"
         self._scene.render.filepath = str(path)
-        bpy.ops.render.render(write_still=True)
+        with _silent():
+            bpy.ops.render.render(write_still=True)
         return OpenEXR.File(str(path), separate_channels=True).channels()
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep Blender's line a sample off the terminal; it writes past Python, to the process's own output."""
+    sys.stdout.flush()
+    shown, hidden = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(hidden, 1)
+        yield
+    finally:
+        os.dup2(shown, 1)
+        os.close(shown)
+        os.close(hidden)
 
 
 def _channels(rendered: dict[str, Any], name: str, letters: str) -> Raster:
