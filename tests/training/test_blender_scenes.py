@@ -226,3 +226,19 @@ def test_a_thing_knows_what_lies_in_its_box():
     assert box.holds(np.array([5.0, 1.9, 1.0]), 0.0)
     assert not box.holds(np.array([6.9, 0.0, 1.0]), 0.0)
     assert box.holds(np.array([6.9, 0.0, 1.0]), 1.0)
+
+
+def test_people_stand_on_the_ground_and_are_dressed(folder):
+    pytest.importorskip("anny")
+    from dior_rt.training.blender.people import make_person
+
+    assets = Assets.open(folder)
+    for seed in (0, 4):
+        entry, mesh = make_person(seed, assets)
+        again, same = make_person(seed, assets)
+        assert entry == again and np.array_equal(mesh.vertices, same.vertices)
+        assert mesh.low[2] == pytest.approx(0, abs=1e-5)
+        assert 0.9 < mesh.size[2] < 2.1
+        assert len(mesh.finishes) >= 6  # skin, clothes, shoes, eyes
+        assert mesh.slots.max() < len(mesh.finishes)
+        assert np.isfinite(mesh.vertices).all()

@@ -52,11 +52,12 @@ def make_assets(
 
 
 def add_people(out: Path, count: int, progress: Callable[[str], None] = lambda name: None) -> list[Entry]:
-    """Write `count` dressed people into an asset folder. Raises InputError."""
+    """Bring the people in an asset folder to `count`; those that are there stay. Raises InputError."""
     assets = Assets.open(out)
     make_folder(out / "people")
     entries = {entry.file: entry for entry in assets.entries}
-    for seed in range(count):
+    there = sum(file.startswith("people/") for file in entries)
+    for seed in range(there, count):
         entry, mesh = make_person(seed, assets)
         save_model(out / entry.file, mesh)
         entries[entry.file] = entry

@@ -22,7 +22,7 @@ GOBO_SHARE = 0.3
 def lamps(scene: BlenderScene, camera: Camera, stage: Stage, hits: Hits, rng: Generator) -> list[Lamp]:
     """Choose the view's lamps; fewer than LAMPS where no more reach enough of what is seen."""
     near: list[Callable[..., Lamp | None]] = [candle, rim, torch]
-    far: list[Callable[..., Lamp | None]] = [key, key, window_light, spot, spot, sun, top]
+    far: list[Callable[..., Lamp | None]] = [key, key, window_light, spot, spot, sun, sun, top]
     chosen: list[Lamp] = []
     for k in range(LAMPS):
         makers = near if k < 3 else far

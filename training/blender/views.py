@@ -23,7 +23,7 @@ from dior_rt.training.blender.store import MEAN_LUMI, View, ViewHead, half, save
 if TYPE_CHECKING:
     from dior_rt.training.blender.cycles import ShootOptions, Shot, Studio
 
-RENDERER: Final = "blender-2"
+RENDERER: Final = "blender-3"
 VIEWS: Final = 2  # a scene
 GOOD: Final = 0.35  # the score at which no further camera is looked through
 LEAST_LIGHTS: Final = 3
