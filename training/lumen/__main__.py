@@ -29,6 +29,7 @@ def fit_command(
     batch: Annotated[int, typer.Option(help="Samples a step.")] = 32,
     rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 1e-3,
     backbone: Annotated[Path | None, typer.Option(help="ImageNet weights to start the features from.")] = None,
+    surfaces: Annotated[Path | None, typer.Option(help="Folder of surface sheets, for new materials.")] = None,
     precision: Annotated[str, typer.Option(help="auto, bf16 or fp32.")] = "auto",
     compiled: Annotated[bool, typer.Option(help="Compile the network: minutes once, then faster.")] = False,
     width: Annotated[int, typer.Option(help="Channels of a token.")] = 320,
@@ -46,7 +47,7 @@ def fit_command(
         print(f"{step:6d} {100 * done:5.1f}% {time.monotonic() - start:6.1f} s  {shown}", flush=True)
 
     try:
-        fit(packs, out, config, sizes, backbone, progress)
+        fit(packs, out, config, sizes, backbone, surfaces, progress)
     except DiorError as error:
         print(error)
         raise typer.Exit(2) from error

@@ -17,7 +17,8 @@ from dior_rt.training.lumen.brush import Brush, draw, random_brush, starts, touc
 from dior_rt.training.lumen.camera import random_cameras
 from dior_rt.training.lumen.completion import FACTOR_SCALE, Strokes
 from dior_rt.training.lumen.lamps import at, cells_at, lamps_along, nearest, positions
-from dior_rt.training.lumen.optics import encode_light, luminance, srgb_to_linear
+from dior_rt.training.lumen.materials import factors
+from dior_rt.training.lumen.optics import encode_light, linear_to_srgb, luminance, srgb_to_linear
 from dior_rt.training.lumen.strokes import ADD, LEAST_FACTOR, MULTIPLY, SET, peak
 from dior_rt.training.lumen.views import Views, from_code
 
@@ -90,8 +91,12 @@ class BatchMaker:
     The n-th batch of a seed is the same on every run on one kind of device.
     """
 
-    def __init__(self, views: Views, count: int, seed: int, side: int | None = None) -> None:
+    def __init__(
+        self, views: Views, count: int, seed: int, side: int | None = None, tiles: Tensor | None = None
+    ) -> None:
+        """tiles: (N, 3, 128, 128) uint8 surfaces for new materials, on the views' device."""
         self.views, self.count, self.seed, self.side = views, count, seed, side or views.size
+        self.tiles = views.albedo.new_zeros(0, 3, 1, 1) if tiles is None else tiles
         self.device = views.images.device
         self.cell_slope = float(views.slope.mean()) * 2 / self.side  # a cell's side at distance 1, about
         self.generator = Generator(device=self.device)
@@ -167,6 +172,9 @@ class BatchMaker:
         ground = (1 - sky)[:, None]
         mean = (lumi * ground).sum(dim=(3, 4), keepdim=True) / ground.sum(dim=(3, 4), keepdim=True).clamp_min(1)
         lumi = torch.where(sky[:, None] > 0, mean * views.world[which][:, :, None, None, None], lumi)
+        factor = factors(ids, self.tiles, self.generator)
+        images = images * factor[:, None]
+        albedo = (srgb_to_linear(cut(views.albedo[which].float() / 255)) * factor).clamp(0, 1)
         normal = cut(views.normal[which].float() / 127.5 - 1)
         normal = F.normalize(normal, dim=1, eps=1e-4) * (1 - sky)
         near, far = views.depth_range[which].split(1, dim=1)
@@ -183,7 +191,7 @@ class BatchMaker:
             usable=views.usable[which] & lit,
             world=views.world[which],
             normal=normal * flip,
-            albedo=cut(views.albedo[which].float() / 255),
+            albedo=linear_to_srgb(albedo),
             position=position * flip,
             depth=depth,
             ids=ids,

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from dior_rt.training.lumen.config import PATCH, LumenConfig
+from dior_rt.training.lumen.config import PATCH, SIDE, LumenConfig
 from dior_rt.training.lumen.layers import Block, Down, Residual, Up, rotations, waves
 from dior_rt.training.lumen.optics import BOUNCED, decode_light, encode_light, log_light, spread
 from dior_rt.training.lumen.scene import Scene
@@ -41,7 +41,8 @@ STATE: Final = 3  # channels of the flow's state
 SCENE: Final = 3 + 3 + 1 + 1 + 3  # photo, normal, depth, sky, light
 MODES: Final = 6  # three blends, each with or without light far from the strokes
 MURK: Final = 0.1  # noise ten times as strong as the image hides half of the state
-HOLD: Final = 0.03  # of the shorter side: how finely the drawn value holds
+HOLD: Final = 0.03  # of the grid's side: how finely the drawn value holds
+EDGE: Final = 0.2  # share of drawn cells around one at which half of the correction is left
 FACTOR_SCALE: Final = 1 / 2.0  # of a log factor in the flow's data variable
 
 
@@ -144,12 +145,11 @@ def compose(maps: Tensor, colours: Tensor, scene: Scene, strokes: Strokes) -> Co
 
 def _factor(reach: Tensor, drawn: Tensor, mask: Tensor) -> Tensor:
     """The logarithm of the factor everywhere: the drawn one nearby, as far as `reach` lets it go."""
-    side = min(mask.shape[2], mask.shape[3])
     wanted = log_factor(drawn)
-    near, far = spread(wanted, mask, NEAR * side, 1e-6), spread(wanted, mask, FAR * side, 1e-6)
-    share = spread(torch.ones_like(mask), mask, NEAR * side, LITTLE)
+    near, far = spread(wanted, mask, NEAR * SIDE, 1e-6), spread(wanted, mask, FAR * SIDE, 1e-6)
+    share = spread(torch.ones_like(mask), mask, NEAR * SIDE, LITTLE)
     factor = torch.sigmoid(reach - 2) * (share * near + (1 - share) * far)
-    return factor + held(wanted - factor, mask, side)
+    return factor + held(wanted - factor, mask)
 
 
 def hold(light: Tensor, drawn: Tensor, mask: Tensor) -> Tensor:
@@ -157,9 +157,8 @@ def hold(light: Tensor, drawn: Tensor, mask: Tensor) -> Tensor:
 
     The correction is a ratio that varies slowly, so the form that shades the light under a stroke stays.
     """
-    side = min(mask.shape[2], mask.shape[3])
     error = log_light(drawn) - log_light(light)
-    corrected = log_light(light) + held(error, mask, side)
+    corrected = log_light(light) + held(error, mask)
     return torch.where(mask.amax(dim=(1, 2, 3), keepdim=True) > 0, _from_log(corrected), light)
 
 
@@ -167,14 +166,13 @@ def _from_log(logarithm: Tensor) -> Tensor:
     return (torch.exp(logarithm) - BOUNCED).clamp_min(0)
 
 
-def held(error: Tensor, mask: Tensor, side: int) -> Tensor:
+def held(error: Tensor, mask: Tensor) -> Tensor:
     """A slowly varying correction that removes the error under the mask and fades out beside it."""
+    beside = spread(torch.ones_like(mask), mask, HOLD * SIDE, EDGE) * (1 + EDGE)
+    amount = torch.maximum(mask, beside.clamp(max=1))
     correction = torch.zeros_like(error)
-    for deviation, least in ((2 * HOLD * side, 0.2), (HOLD * side, 0.2)):
-        left = error - correction
-        near = spread(left, mask, deviation, 1e-3)
-        beside = spread(torch.ones_like(mask), mask, HOLD * side, 0.0 + least) * (1 + least)
-        correction = correction + near * torch.maximum(mask, beside.clamp(max=1))
+    for deviation in (2 * HOLD * SIDE, HOLD * SIDE):
+        correction = correction + amount * spread(error - correction, mask, deviation)
     return correction
 
 

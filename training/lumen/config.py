@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from dior_rt.errors import InputError
 
 PATCH = 8  # side of a token, in cells
+SIDE = 128  # root of a grid's number of cells: the side that distances in cells refer to
 
 
 @dataclass(frozen=True)

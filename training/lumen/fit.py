@@ -20,6 +20,7 @@ from dior_rt.training.lumen.backbone import load_imagenet
 from dior_rt.training.lumen.batches import Batch, BatchMaker
 from dior_rt.training.lumen.config import LumenConfig
 from dior_rt.training.lumen.loss import loss
+from dior_rt.training.lumen.materials import load_tiles
 from dior_rt.training.lumen.model import Lumen
 from dior_rt.training.lumen.pack import load_shards
 
@@ -86,6 +87,7 @@ def fit(
     config: FitConfig,
     sizes: LumenConfig = LumenConfig(),
     backbone: Path | None = None,
+    surfaces: Path | None = None,
     progress: Progress | None = None,
 ) -> None:
     """Train on the shards in `packs`; the folder `out` receives the state in parts and resumes from it."""
@@ -103,7 +105,8 @@ def fit(
     clock = Clock(config)
     if (out / INDEX).exists():
         resume(out, network, average, optimizer, clock)
-    maker = BatchMaker(load_shards(packs).to(device), config.batch, config.seed)
+    tiles = load_tiles(surfaces).to(device) if surfaces is not None else None
+    maker = BatchMaker(load_shards(packs).to(device), config.batch, config.seed, tiles=tiles)
     step = make_step(network, config, device)
     running: dict[str, float] = {}
     saved = last = time.monotonic()

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dior_rt.training.lumen.optics import double
+
 LARGEST_LOGIT = 8.0
 Turns = tuple[Tensor, Tensor]  # cosine and sine of each token's position
 
@@ -103,8 +105,7 @@ class Up(nn.Module):
         self.refine = Residual(out)
 
     def forward(self, cells: Tensor, skip: Tensor) -> Tensor:
-        wide = F.interpolate(self.narrow(cells), scale_factor=2.0, mode="bilinear", align_corners=False)
-        return self.refine(wide + skip)
+        return self.refine(double(self.narrow(cells)) + skip)
 
 
 def waves(sigma: Tensor, width: int) -> Tensor:

@@ -19,7 +19,7 @@ from torch.nn import functional as F
 from dior_rt.training.lumen.backbone import FEATURES, Backbone
 from dior_rt.training.lumen.config import PATCH, LumenConfig
 from dior_rt.training.lumen.layers import Block, Down, Residual, Up, rotations
-from dior_rt.training.lumen.optics import decode_light, luminance, resize, srgb_to_linear
+from dior_rt.training.lumen.optics import decode_light, double, luminance, srgb_to_linear
 
 NORMAL, DEPTH, SKY, ALBEDO = 3, 1, 1, 3  # channels of the geometry head
 ORIENTATION = 4  # how brightness depends on the normal's three components, and a constant
@@ -72,8 +72,7 @@ class SceneNetwork(nn.Module):
     def forward(self, photo: Tensor) -> Scene:
         """photo: (B, 3, H, W), sRGB in 0..1, H and W multiples of 8."""
         rows, columns = photo.shape[2] // PATCH, photo.shape[3] // PATCH
-        large = resize(photo, (2 * photo.shape[2], 2 * photo.shape[3]))
-        seen4, seen8, seen16 = self.backbone(large)  # strides 2, 4 and 8 of the photo
+        seen4, seen8, seen16 = self.backbone(double(photo))  # strides 2, 4 and 8 of the photo
         linear = srgb_to_linear(photo)
         fine = F.silu(self.see(torch.cat([2 * photo - 1, torch.log(linear + 0.01) / 3], dim=1)))  # (B, fine, H, W)
         half = self.to_half(fine, seen4)  # (B, half, H / 2, W / 2)
@@ -96,7 +95,7 @@ class SceneNetwork(nn.Module):
     def _light(self, half: Tensor, pooled: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
         """The light (B, 3, H, W), linear, and the shares of bounced light (B, 2, H, W)."""
         colours = self.config.colours
-        maps = resize(self.light(half).float(), (normal.shape[2], normal.shape[3]))
+        maps = double(self.light(half).float())
         oriented, shares, bounce = maps.split((ORIENTATION, colours, BOUNCES), dim=1)
         code = (oriented[:, :3] * normal).sum(dim=1, keepdim=True) + oriented[:, 3:]
         bright = decode_light(F.softplus(code, beta=8.0).clamp(max=2.5))

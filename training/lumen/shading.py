@@ -11,16 +11,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dior_rt.training.lumen.config import SIDE
 from dior_rt.training.lumen.optics import BOUNCED, FLOOR, blur, linear_to_srgb, srgb_to_linear
 
-NEARBY = 1 / 10  # of the shorter side: how far light bounces to its surroundings
+NEARBY = 1 / 10  # of the grid's side: how far light bounces to its surroundings
 
 
 def bounced(light: Tensor, bounce: Tensor) -> Tensor:
     """Light (B, 3, H, W) with what has bounced; bounce: (B, 2, H, W)."""
-    side = min(light.shape[2], light.shape[3])
     near, far = bounce[:, :1], bounce[:, 1:]
-    return light + near * blur(light, NEARBY * side) + far * light.mean(dim=(2, 3), keepdim=True) + BOUNCED
+    return light + near * blur(light, NEARBY * SIDE) + far * light.mean(dim=(2, 3), keepdim=True) + BOUNCED
 
 
 def log_ratio(source: Tensor, target: Tensor, bounce: Tensor, factor: Tensor) -> Tensor:

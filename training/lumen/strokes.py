@@ -12,12 +12,13 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from dior_rt.training.lumen.config import SIDE
 from dior_rt.training.lumen.optics import encode_light, log_light, luminance, spread
 
 SET, ADD, MULTIPLY = 0, 1, 2
 BLENDS: Final = {"set": SET, "add": ADD, "multiply": MULTIPLY}
 LEAST_FACTOR: Final = 0.02  # the darkest that a factor can make, and what keeps its logarithm finite
-NEAR: Final = 1 / 16  # of the grid's shorter side: how far strokes speak for their surroundings
+NEAR: Final = 1 / 16  # of the grid's side: how far strokes speak for their surroundings
 FAR: Final = 1 / 4
 LITTLE: Final = 1e-3
 CHANNELS: Final = 7  # ratio, light, mask
@@ -46,10 +47,9 @@ def stroke_features(drawn: Tensor, mask: Tensor, blend: Tensor, light: Tensor) -
     ratio = is_set * (log_light(drawn) - log_light(light)) + is_multiply * log_factor(drawn)
     code = encode_light(drawn * is_set + drawn / peak(drawn, mask) * is_add)
     values = torch.cat([ratio, code], dim=1)
-    side = min(mask.shape[2], mask.shape[3])
-    near, far = (around(values, mask, share * side) for share in (NEAR, FAR))
+    near, far = (around(values, mask, share * SIDE) for share in (NEAR, FAR))
     features = torch.cat([values * mask, mask, near, far], dim=1)
-    return features, drawn_colours(drawn, mask, light, side)
+    return features, drawn_colours(drawn, mask, light)
 
 
 def around(values: Tensor, mask: Tensor, deviation: float) -> Tensor:
@@ -58,11 +58,11 @@ def around(values: Tensor, mask: Tensor, deviation: float) -> Tensor:
     return spread(torch.cat([values, ones], dim=1), mask, deviation, LITTLE)
 
 
-def drawn_colours(drawn: Tensor, mask: Tensor, light: Tensor, side: int) -> Tensor:
+def drawn_colours(drawn: Tensor, mask: Tensor, light: Tensor) -> Tensor:
     """(B, 4, 3, H, W): the drawn colour nearby, farther off and everywhere, and the photo's own, of luminance 1."""
     white = drawn.new_full((1, 3, 1, 1), 1e-3)
     everywhere = (drawn * mask).mean(dim=(2, 3), keepdim=True).expand_as(drawn)
-    near, far = (spread(drawn, mask, share * side, 1e-6) for share in (NEAR, FAR))
+    near, far = (spread(drawn, mask, share * SIDE, 1e-6) for share in (NEAR, FAR))
     # Where nothing is drawn nearby, the farther colour stands in.
     choices = [near + 0.01 * far + 1e-4 * everywhere, far + 0.01 * everywhere, everywhere, light]
     stacked = torch.stack([choice + white for choice in choices], dim=1)
