@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from dior_rt.errors import InputError
+from dior_rt.training.blender.store import load_view
 from dior_rt.training.lumen.optics import linear_to_srgb
 from dior_rt.training.lumen.views import Views, to_code
 
@@ -48,6 +50,26 @@ class Rendered:
     ids: NDArray[np.int32]  # (H, W)
     sky: NDArray[np.bool_]  # (H, W)
     slope: float  # tangent of half the angle of view
+
+
+def rendered(path: Path) -> Rendered:
+    """A view that `dior_rt.training.blender` stored. Raises InputError."""
+    view = load_view(path)
+    sky = view.sky.astype(np.float32) > 0.5
+    lumi = view.lumi_maps().astype(np.float32)
+    lumi[:, sky] = 0
+    return Rendered(
+        name=path.stem,
+        images=view.images.astype(np.float32)[:SOURCES],
+        lumi=lumi[:SOURCES],
+        world=np.array([light["kind"] == "world" for light in view.head.lights])[:SOURCES],
+        normal=view.normals.astype(np.float32),
+        albedo=view.albedo.astype(np.float32),
+        depth=np.where(sky, 1e3, view.depth.astype(np.float32)),
+        ids=view.ids.astype(np.int32),
+        sky=sky,
+        slope=math.tan(math.radians(view.head.camera["fov"]) / 2),
+    )
 
 
 def sheet(tiles: NDArray[np.uint8]) -> Bytes:
