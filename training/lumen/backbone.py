@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import torch
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from dior_rt.files import replacing
 
 NORM_EPSILON: Final = 1e-3
 FEATURES: Final = (24, 40, 112)  # channels at strides 4, 8 and 16
@@ -92,7 +95,13 @@ class Inverted(nn.Module):
 
 
 def load_imagenet(backbone: Backbone, path: Path) -> None:
-    """Fill the backbone with the published ImageNet weights, a state dict that torch loads without pickle's code."""
+    """Fill the backbone with ImageNet weights.
+
+    path: the published state dict (.pth, read without running pickled code), or what `save_backbone` wrote.
+    """
+    if path.suffix == ".safetensors":
+        backbone.load_state_dict({name: weight.float() for name, weight in load_file(path).items()})
+        return
     stored = torch.load(path, map_location="cpu", weights_only=True)
 
     def fold(conv: nn.Conv2d, weight: str, norm: str) -> None:
@@ -109,3 +118,9 @@ def load_imagenet(backbone: Backbone, path: Path) -> None:
             fold(block.expand, f"{name}._expand_conv.weight", f"{name}._bn0")
         fold(block.depthwise, f"{name}._depthwise_conv.weight", f"{name}._bn1")
         fold(block.project, f"{name}._project_conv.weight", f"{name}._bn2")
+
+
+def save_backbone(backbone: Backbone, path: Path) -> None:
+    """Write the folded weights as safetensors."""
+    with replacing(path) as file:
+        file.write(save({name: weight.contiguous() for name, weight in backbone.state_dict().items()}))
