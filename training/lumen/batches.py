@@ -28,6 +28,7 @@ SHARES: Final = (0.27, 0.18, 0.20, 0.27, 0.08)
 SATURATED: Final = 0.08  # share of photos with a light of any hue
 DENSE, COARSE = 0.08, 0.08  # shares of `set` samples whose whole map, or coarse parts of it, is given
 SKY_ID: Final = 255
+BRIGHTEST: Final = 100.0  # light that a sample may have; encoded, 3.04
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,7 @@ class BatchMaker:
         brush = random_brush(self.count, self.side, self.generator, self.device)
         scene, first = self._local(scenery, kind, blend, scene, brush)
         strokes, scene = self._draw(scenery, kind, blend, far, scene, brush, first)
+        strokes, scene = usual(strokes, scene)
         cameras = random_cameras(self.count, self.generator, self.device)
         shot = cameras.shoot(photo, self.generator)
         truth = Truth(
@@ -383,6 +385,21 @@ def mix(scenery: Scenery, lights: Tensor) -> tuple[Tensor, Tensor]:
     """Picture and Lumi map (B, 3, H, W) of the sources at strength times colour (B, K, 3)."""
     weights = lights[:, :, :, None, None]
     return (scenery.images * weights).sum(dim=1), (scenery.lumi * weights).sum(dim=1)
+
+
+def usual(strokes: Strokes, scene: Lit) -> tuple[Strokes, Lit]:
+    """Drop the strokes of samples whose light is far beyond what people draw, or not a number; nothing changes there."""
+    most = torch.stack([part.flatten(1).amax(dim=1) for part in (scene.light, scene.target, scene.relit, strokes.drawn)])
+    fine = (most.isfinite() & (most < BRIGHTEST)).all(dim=0)[:, None, None, None]
+    light = torch.where(fine, scene.light, scene.light.nan_to_num(0, 0, 0).clamp(0, 1))
+    scene = replace(
+        scene,
+        light=light,
+        relit=torch.where(fine, scene.relit, scene.photo),
+        target=torch.where(fine, scene.target, light),
+    )
+    drawn = torch.where(fine, strokes.drawn, torch.zeros_like(strokes.drawn))
+    return strokes._replace(drawn=drawn, mask=strokes.mask * fine), scene
 
 
 def bright_part(picture: Tensor) -> Tensor:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -35,7 +36,7 @@ AVERAGE: Final = 0.06  # the time constant of the weights' average, as a share o
 class FitConfig:
     """How to train.
 
-    minutes: of training, after the first steps have been compiled; None: `steps` decide.
+    minutes: of training, loading and compiling included; None: `steps` decide.
     steps: of the optimiser, where minutes is None.
     batch: samples a step.
     rate: AdamW's largest learning rate.
@@ -65,10 +66,12 @@ class Clock:
     step: int = 0
     spent: float = 0.0  # seconds
 
+    setup: float = 0.0  # seconds of this process before training ran at full speed
+
     @property
     def done(self) -> float:
         if self.config.minutes is not None:
-            return self.spent / (60 * self.config.minutes)
+            return self.spent / max(60 * self.config.minutes - self.setup, 1.0)
         return self.step / self.config.steps
 
     @property
@@ -109,8 +112,9 @@ def fit(
     maker = BatchMaker(load_shards(packs).to(device), config.batch, config.seed, tiles=tiles)
     step = make_step(network, config, device)
     running: dict[str, float] = {}
-    saved = last = time.monotonic()
+    skipped = torch.zeros((), device=device)
     first = clock.step
+    begun = saved = last = time.monotonic() - seconds_since_start()
     while clock.done < 1:
         for group in optimizer.param_groups:
             group["lr"] = config.rate * group["share"] * clock.rate
@@ -118,9 +122,12 @@ def fit(
         generator.manual_seed(config.seed * 7_919 + clock.step)
         batch = maker.make(clock.step)
         errors = step(batch, *states(batch, config, generator))
-        nn.utils.clip_grad_norm_(network.parameters(), config.clip)
+        skipped += clip(list(network.parameters()), config.clip)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
+        if config.compiled and clock.step - first == 15 and float(skipped) > 3:
+            print(f"{float(skipped):.0f} of 15 compiled steps had no finite gradient; going on without compiling.", flush=True)
+            step, skipped = make_step(network, replace(config, compiled=False), device), torch.zeros((), device=device)
         with torch.no_grad():
             share = max(1 / (clock.step + 2), min(0.05, clock_share(clock, first)))
             torch._foreach_lerp_(average, [weight.detach() for weight in network.parameters()], share)
@@ -128,18 +135,44 @@ def fit(
         if clock.step % 20 == 0 or device.type == "cpu":
             for name, error in errors.items():
                 value = float(error)
-                running[name] = value if name not in running else 0.8 * running[name] + 0.2 * value
-            if not all(math.isfinite(value) for value in running.values()):
-                raise InputError(f"Training diverged at step {clock.step}: an error is not a number. Lower --rate.")
+                if math.isfinite(value):
+                    running[name] = value if name not in running else 0.8 * running[name] + 0.2 * value
+            running["skipped"] = float(skipped)
+            if float(skipped) > 20 + 0.6 * (clock.step - first):
+                raise InputError(f"Training diverged at step {clock.step}: most gradients are not finite. Lower --rate.")
             if progress:
                 progress(clock.step, clock.done, running)
         now = time.monotonic()
-        if clock.step - first > 3:  # the first steps compile
+        if clock.step - first > 3:
             clock.spent += now - last
+        else:  # the first steps compile
+            clock.setup = now - begun
         last = now
         if now - saved > config.save_every or clock.done >= 1:
             store(out, network, average, optimizer, clock)
             saved = time.monotonic()
+
+
+def seconds_since_start() -> float:
+    """How long this process has run, as far as the system tells."""
+    try:
+        ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
+        uptime = float(Path("/proc/uptime").read_text().split()[0])
+        return max(0.0, uptime - ticks / os.sysconf("SC_CLK_TCK"))
+    except (OSError, ValueError, IndexError):
+        return 0.0
+
+
+def clip(weights: list[nn.Parameter], largest: float) -> Tensor:
+    """Scale the gradients to a norm of at most `largest`; gradients that are not finite become 0. Returns 1 for these."""
+    gradients = [weight.grad for weight in weights if weight.grad is not None]
+    norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
+    bad = ~norm.isfinite()
+    factor = torch.where(bad, torch.zeros_like(norm), (largest / (norm + 1e-6)).clamp(max=1))
+    for gradient in gradients:
+        gradient.nan_to_num_(0.0, 0.0, 0.0)
+    torch._foreach_mul_(gradients, factor)
+    return bad.float()
 
 
 def clock_share(clock: Clock, first: int) -> float:
