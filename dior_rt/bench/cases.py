@@ -1,4 +1,4 @@
-"""Photos and light drawn on them, by the dozen: from held-out renders, or made by arithmetic."""
+"""Many photos with strokes: from held-out renders, or synthetic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OPS = NumpyOps()
 
 @dataclass(frozen=True)
 class Case:
-    """photo: (H, W, 3) uint8, sRGB. strokes: of its size. seed: of the noise."""
+    """A photo (H, W, 3), uint8, sRGB, with strokes of the same size and a seed for the noise."""
 
     photo: NDArray[np.uint8]
     strokes: Strokes
@@ -26,13 +26,16 @@ class Case:
 
 
 def made_up(count: int) -> list[Case]:
-    """Balls before a textured wall under one light, and strokes of any colour and strength."""
+    """Return synthetic cases: balls before a textured wall, and strokes of random colour and strength."""
     return [_made_up(np.random.default_rng([number, 71]), number) for number in range(count)]
 
 
 def from_renders(folder: Path, count: int) -> list[Case]:
-    """Pairs mixed from a folder of renders; half replace all lights, half change one, and of each half the
-    light is given whole or as strokes. Needs dior-rt[train]. Raises InputError for too few renders."""
+    """Return pairs mixed from a folder of renders. Needs dior-rt[train].
+
+    Half of the pairs replace all lights, half change one. In each half, the light is alternately a whole
+    map or strokes. Raises InputError for too few renders.
+    """
     from dior_rt.training.data.triplets import interest, load_views, pair
 
     views = load_views(folder)
