@@ -38,7 +38,11 @@ def clone(tmp_path: Path) -> Path:
 
 def test_the_python_example_runs(clone: Path) -> None:
     result = subprocess.run(
-        [sys.executable, "-c", block("docs/python.md", "python")], cwd=clone, capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", block("docs/python.md", "python")],
+        cwd=clone,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert result.returncode == 0, result.stderr
     assert "4/4" in result.stdout
