@@ -1,7 +1,7 @@
 """Check that identifiers use the words of the field and no private ones.
 
-A private word is one that a newcomer cannot look up: `said` for the features of the strokes, `own` for the source
-light. Each entry names the words to use instead.
+A private word is one that a newcomer cannot look up: `said` for the features of the strokes, `own` for the
+source light. Each entry names the words to use instead.
 """
 
 from __future__ import annotations

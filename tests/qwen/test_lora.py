@@ -126,7 +126,7 @@ def test_a_lora_of_another_width_is_refused(folders, tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        (["img_in.lora_A.weight"], "only half of its change to 'img_in'"),
+        (["img_in.lora_A.weight"], "only one of the two matrices for 'img_in'"),
         (
             ["img_in.lora_A.weight", "img_in.lora_B.weight", "img_in.dora_scale"],
             "it holds 'img_in.dora_scale'",
