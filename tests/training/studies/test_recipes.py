@@ -61,6 +61,7 @@ def answer(network, batch, sigma: float, noise) -> torch.Tensor:
     return x - sigma * network(x=x, sigma=torch.full((len(x),), sigma), **seen(batch))
 
 
+@pytest.mark.slow
 def test_the_same_walk_as_the_runtimes(tmp_path) -> None:
     network, random = noisy_mini(0), np.random.default_rng(0)
     photo = random.integers(0, 256, (48, 64, 3), np.uint8)
@@ -175,6 +176,7 @@ FEW = (
 )
 
 
+@pytest.mark.slow
 def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_path) -> None:
     seen = []
     first = replace(FEW[0], walks=(ONCE,))
@@ -206,6 +208,7 @@ def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_
     assert again == evaluation and len(seen) == seen[-1]
 
 
+@pytest.mark.slow
 def test_a_stopped_study_goes_on_with_the_batches_it_had_not_seen(renders, tmp_path) -> None:
 
     def stop(step: int, loss: float) -> None:
