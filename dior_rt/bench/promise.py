@@ -93,7 +93,7 @@ def cost(preset: Preset, bundle: Bundle) -> int:
     schedule = ShiftSchedule(preset.shift) if preset.shift else manifest.schedule
     assert isinstance(schedule, ShiftSchedule)
     sigmas, asks = schedule.sigmas(preset.steps).tolist(), SOLVERS[preset.solver].asks
-    asked = [sigma for sigma in sigmas[:1] + sigmas[1:-1] * asks]
+    asked = sigmas[:1] + sigmas[1:-1] * asks
     low, high = preset.interval
     if manifest.guidance in (0, 1):
         return len(asked)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,7 @@ class ShiftSchedule:
 
     def sigmas(self, steps: int) -> NDArray[np.float32]:
         """Return steps + 1 falling values, the first 1 and the last 0."""
-        u = _even(steps)
-        return np.append(self.shift * u / (1 + (self.shift - 1) * u), 0.0).astype(np.float32)
+        return np.append(shift_sigma(_even(steps), self.shift), 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -64,6 +63,14 @@ class DynamicShiftSchedule:
         if steps > 1:  # the last sigma of a single step is its first, which is pure noise
             sigma = 1 - (1 - sigma) * (1 - self.terminal) / (1 - sigma[-1])
         return np.append(sigma, 0.0).astype(np.float32)
+
+
+def shift_sigma(u: Any, shift: float) -> Any:
+    """Return s u / (1 + (s - 1) u): even flow time u, moved towards noise by a shift s > 1.
+
+    u: a NumPy array, a torch tensor or a float; training draws its sigmas with the same function.
+    """
+    return shift * u / (1 + (shift - 1) * u)
 
 
 Schedule = ShiftSchedule | DynamicShiftSchedule

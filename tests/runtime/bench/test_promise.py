@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dior_rt.bench.cases import from_renders, made_up
+from dior_rt.bench.cases import made_up
 from dior_rt.bench.promise import (
     IDENTICAL,
     MARGIN,
@@ -131,6 +131,7 @@ def test_it_keeps_them_in_the_worst_of_50_cases() -> None:
 @pytest.mark.slow
 def test_it_keeps_them_on_renders_that_training_has_not_seen(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
+    from dior_rt.training.data.bench_cases import from_renders
     from dior_rt.training.data.render import render_scenes
 
     render_scenes(tmp_path, 25, 900)  # a set of scenes of its own

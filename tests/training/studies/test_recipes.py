@@ -9,8 +9,7 @@ import torch
 from safetensors.torch import load_file
 
 from dior_rt.cli import run
-from dior_rt.export.mini import Recipe as Exported
-from dior_rt.export.mini import export_network
+from dior_rt.export.mini import MiniExportConfig, export_network
 from dior_rt.kernels import Strokes
 from dior_rt.relight import Relighter
 from dior_rt.training.data.triplets import Batches
@@ -68,7 +67,7 @@ def test_the_same_walk_as_the_runtimes(tmp_path) -> None:
     mask = np.zeros((48, 64), np.float32)
     mask[10:20, 30:50] = 1
     strokes = Strokes((random.uniform(0, 2, (48, 64, 3)) * mask[..., None]).astype(np.float32), mask)
-    exported = Exported(name="small", grid=GRID, steps=5, guidance=1.0, noise_scale=0.5)
+    exported = MiniExportConfig(name="small", grid=GRID, steps=5, guidance=1.0, noise_scale=0.5)
     bundle = export_network(network, exported, tmp_path / "small", weights="fp32")
     expected = np.asarray(Relighter(bundle.folder, ops="numpy").relight(photo, strokes, seed=3).picture)
     got = Network(network, Walk(5, 0.5, seed=3)).relight(photo, strokes)
