@@ -83,13 +83,13 @@ class Ops(ABC):
     ) -> Strokes:
         """Return the part of a dense Lumi map (H, W, 3) that a person might have drawn.
 
-        The mask is 0 or 1, and never 0 everywhere. A seed (an int >= 0) gives the same mask on every device, bit
-        for bit. The modes are
+        The mask is 0 or 1, and never 0 everywhere. A seed (an int >= 0) gives the same mask on every device,
+        bit for bit. The modes are
 
             dense    everything
-            strokes  one to eight freehand strokes, under which each pixel keeps its value. They start alternately
-                     in bright and dark regions, or in proportion to `interest` (H, W) >= 0 unless that is 0
-                     everywhere
+            strokes  one to eight freehand strokes, under which each pixel keeps its value. They start
+                     alternately in bright and dark regions, or in proportion to `interest` (H, W) >= 0 unless
+                     that is 0 everywhere
             coarse   the map at a random coarser resolution, without a random share of the cells; a cell holds
                      the mean of its pixels
         """

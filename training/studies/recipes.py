@@ -1,12 +1,12 @@
-"""The recipes: how mini may be trained and sampled, by short runs side by side at equal cost.
+"""The recipes: compare ways to train and sample mini, by short runs at equal cost.
 
-Every row starts from the same seed, sees the same batches in the same order and spends as many
-floating-point operations as `what ships`; so a larger network, or one that asks another, takes fewer steps.
-The rows differ in what the flow starts from, in what comes before it, or in the network's shape.
+Every row starts from the same seed, sees the same batches in the same order and spends as many floating-point
+operations as `what ships`. So a larger network, or one that evaluates another, takes fewer steps. The rows
+differ in the start of the flow, in what is trained before, or in the network's shape.
 
-A flow from N(0, 1) to x0 and one from N(c, s^2) have, after a change of clock and scale, the same states:
-what a narrow prior or an estimate in the middle changes is where training spends its draws, and what the
-network is told.
+After a change of clock and scale, a flow from N(0, 1) to x0 and one from N(c, s^2) have the same states. So
+a narrow prior, or an estimate as its mean, changes only the distribution of training draws and the inputs
+of the network.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from dior_rt.training.network import WEIGHTS, Config, Mini, load_network, save_n
 from dior_rt.training.studies.ablation import AHEAD, PAIRS, STILL, Budget, Network, Walk, figures, follow
 from dior_rt.training.studies.variants import AboutEstimate, sever
 
-EXAMPLES: Final = 2  # of a row, for the contact sheet
+EXAMPLES: Final = 2  # per row, for the contact sheet
 CONTROL: Final = "The light is cut from the true Lumi map of the target."
 BRUSH: Final = (
     "One step without noise. White dabs at 0.25 to 4 times the light that is there; borders: differences of "
@@ -49,17 +49,23 @@ ONCE: Final = Walk()
 
 
 def walks(noise: float) -> tuple[Walk, ...]:
-    """One step, and several from noise. A single step is the same with noise: at sigma = 1 the network does
-    not look at the state."""
+    """Return one step without noise, and several steps from noise.
+
+    A single step is the same with noise, because at sigma = 1 the network ignores the state.
+    """
     return ONCE, Walk(4, noise), Walk(20, noise)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A row. silent, always_noise, noise: of its `Plan`. share: of the cost, its own part. after: what is
-    trained before, and gone on from; about: it stays as it is, and the flow is about its answer.
-    patch, widen: the network's patch, and how many times as wide it is. blended: whether its convolutions
-    blend the transformer's answer across the patches' borders. walks: how its flow is judged.
+    """A row.
+
+    silent, always_noise, noise: as in `Plan`. share: its part of the cost.
+    after: the recipe that is trained before and continued. about: `after` stays frozen, and the flow models
+    the difference to its answer.
+    patch, widen: the network's patch, and the factor of its width.
+    blended: whether convolutions blend the transformer's answer across the borders of patches.
+    walks: how its flow is sampled when it is judged.
     """
 
     name: str
@@ -118,16 +124,16 @@ def study(
     recipes: Sequence[Recipe] = RECIPES,
     progress: Progress | None = None,
 ) -> tuple[Evaluation, list[Example]]:
-    """Train every row into the folder `out` and judge it over held-out views; what is trained is kept.
+    """Train every row into the folder `out` and judge it on held-out views. Trained rows are kept.
 
-    plan: of the first row, and but for steps and noise of all. progress: told the steps of all rows.
-    Raises InputError for what cannot be used.
+    plan: of the first row; the other rows differ in steps and noise. progress: called with the steps of all
+    rows. Raises InputError for unusable input.
     """
     tasks, still = pairs(held_out, PAIRS, seed=1), pairs(held_out, STILL, seed=3)
     batches = Shared(iter(Batches(load_views(renders), plan.batch, plan.seed, grids=plan.grids)))
     plans = at_equal_cost(plan, small, recipes)
     trained: dict[Recipe, nn.Module] = {}
-    before = 0  # steps of the rows that are trained
+    before = 0  # steps of the rows before this one
     for recipe, own in plans.items():
         tell = None if progress is None else partial(_told, progress, before)
         trained[recipe] = train(recipe, own, small, trained, batches.after(plans, recipe), out, tell)
@@ -138,7 +144,7 @@ def study(
 
 
 def total_steps(plan: Plan = PLAN, small: Config = SMALL, recipes: Sequence[Recipe] = RECIPES) -> int:
-    """Of all rows, and of what is trained before them."""
+    """Return the steps of all rows and of the recipes trained before them."""
     return sum(own.steps for own in at_equal_cost(plan, small, recipes).values())
 
 
@@ -147,7 +153,7 @@ def _told(progress: Progress, before: int, step: int, loss: float) -> None:
 
 
 def pairs(held_out: Path, kinds: Sequence[str], seed: int) -> list[Task]:
-    """Pairs of the views. Raises InputError where there are none."""
+    """Return pairs of the views. Raises InputError if there are none."""
     found = benchmarks(held_out, kinds, seed)
     if not found:
         raise InputError(
@@ -157,7 +163,7 @@ def pairs(held_out: Path, kinds: Sequence[str], seed: int) -> list[Task]:
 
 
 def at_equal_cost(plan: Plan, small: Config, recipes: Sequence[Recipe]) -> dict[Recipe, Plan]:
-    """What is trained, in an order in which it can be, and for so long that all rows cost the same."""
+    """Return the plan of each recipe, in the order of training, such that all rows cost the same."""
     ordered = dict.fromkeys(each for recipe in recipes for each in (recipe.after, recipe) if each)
     whole = plan.steps * step_cost(Mini(small), plan)
     return {
@@ -173,7 +179,7 @@ def at_equal_cost(plan: Plan, small: Config, recipes: Sequence[Recipe]) -> dict[
 
 
 def step_cost(network: nn.Module, plan: Plan) -> int:
-    """Floating-point operations of a training step's products and convolutions, there and back."""
+    """Return the operations of a training step's products and convolutions, forward and backward."""
     count, (height, width) = plan.batch, plan.grids[0]
     planes = torch.zeros(count, 3, height, width)
     batch = {name: planes for name in ("photo", "light", "x0", "own")}
@@ -184,7 +190,7 @@ def step_cost(network: nn.Module, plan: Plan) -> int:
 
 
 def cost(recipe: Recipe, plans: Mapping[Recipe, Plan], small: Config) -> Cost:
-    """Of a row, with what was trained before it."""
+    """Return the cost of a row, including the recipe trained before it."""
     own, network = plans[recipe], _blank(recipe, small)
     earlier = cost(recipe.after, plans, small) if recipe.after else Cost(0, 0, 0)
     weights = sum(weight.numel() for weight in network.parameters())
@@ -194,7 +200,7 @@ def cost(recipe: Recipe, plans: Mapping[Recipe, Plan], small: Config) -> Cost:
 
 @dataclass(frozen=True)
 class Cost:
-    """weights: of all networks that an answer needs. flops: of training."""
+    """weights: of all networks that an answer needs. flops: operations of training."""
 
     samples: int
     weights: int
@@ -205,13 +211,13 @@ class Cost:
 
 
 class Shared:
-    """Batches that are drawn once, as far as some row needs them, for all rows."""
+    """Batches that are drawn once and shared by all rows."""
 
     def __init__(self, source: Iterator[Batch]) -> None:
         self.source, self.drawn = source, list[Batch]()
 
     def after(self, plans: Mapping[Recipe, Plan], recipe: Recipe) -> Stream:
-        """A row's, which begin where those of what was trained before it end."""
+        """Return a row's batches, which begin where those of the recipe before it end."""
         first = plans[recipe.after].steps if recipe.after else 0
         end = first + plans[recipe].steps
 
@@ -243,7 +249,7 @@ def train(
     out: Path,
     progress: Progress | None,
 ) -> nn.Module:
-    """A recipe's network with its averaged weights. trained: what it may go on from."""
+    """Return a recipe's network with averaged weights. trained: the networks it may continue."""
     torch.manual_seed(plan.seed)
     folder, base = out / recipe.folder, trained[recipe.after] if recipe.after else None
     network = _network(recipe, small, base)
@@ -259,7 +265,7 @@ def train(
 
 
 def _network(recipe: Recipe, small: Config, base: nn.Module | None) -> nn.Module:
-    """What a recipe's training begins with."""
+    """Return the network with which a recipe's training begins."""
     network = deepcopy(base) if base else Mini(recipe.config(small))
     if not recipe.blended:
         assert isinstance(network, Mini)
@@ -268,7 +274,7 @@ def _network(recipe: Recipe, small: Config, base: nn.Module | None) -> nn.Module
 
 
 def _blank(recipe: Recipe, small: Config) -> nn.Module:
-    """A network of the recipe's shape."""
+    """Return a new network of the recipe's shape."""
     return _network(recipe, small, Mini(recipe.config(small)) if recipe.after else None)
 
 
@@ -278,10 +284,10 @@ def judge(
     tasks: Sequence[Task],
     still: Sequence[Task],
 ) -> tuple[Evaluation, list[Example]]:
-    """The rows over pairs of held-out views, and under the brush on views that keep their light.
+    """Judge the rows on pairs of held-out views, and with the brush on views that keep their light.
 
-    What the first row answers in one step is what all are compared with, picture by picture. The examples
-    are of each row's strokes in one step.
+    All rows are compared with the first row in one step, per picture. The examples show each row under
+    strokes in one step.
     """
     strokes = {drawn: [task.control(drawn) for task in tasks] for drawn in DRAWN}
     first: dict[str, list[float]] = {}
@@ -318,7 +324,7 @@ def judge(
 
 
 def answers(network: nn.Module, walk: Walk, tasks: Sequence[Task], strokes: Sequence[Strokes]) -> list[Photo]:
-    """Every task's source under its strokes; each from noise of its own, the same for all rows."""
+    """Relight every task's source under its strokes. Each task has its own noise, the same for all rows."""
     return [
         Network(network, replace(walk, seed=task.seed)).relight(task.source, drawn)
         for task, drawn in zip(tasks, strokes, strict=True)
@@ -326,12 +332,12 @@ def answers(network: nn.Module, walk: Walk, tasks: Sequence[Task], strokes: Sequ
 
 
 def borders(network: nn.Module, patch: int, task: Task, strokes: Strokes) -> float:
-    """See `border_ratio`, of the light that a picture gains under strokes."""
+    """Return `border_ratio` of the light that a picture gains under strokes."""
     source, relit = Network(network).light(task.source, strokes)
     return border_ratio(np.log((relit + E) / (source + E)), patch)
 
 
 def named(walk: Walk) -> str:
-    """How a flow is walked, in words."""
+    """Describe a walk in words."""
     steps = f"{walk.steps} step{'s' if walk.steps > 1 else ''}"
     return f"{steps} from noise {walk.noise:g}" if walk.noise else f"{steps} without noise"
