@@ -49,9 +49,9 @@ class OpenCLOps(Ops):
             self._map(self._kernel("encode", dtype), linear, picture, table)
         return picture
 
-    def _map(self, kernel: cl.Kernel, given: np.ndarray, result: np.ndarray, *table: cl.Buffer) -> None:
+    def _map(self, kernel: cl.Kernel, buffers: np.ndarray, result: np.ndarray, *table: cl.Buffer) -> None:
         """Run an elementwise kernel from one array to another of the same shape."""
-        session, flat, out = self._session, given.reshape(-1), result.reshape(-1)
+        session, flat, out = self._session, buffers.reshape(-1), result.reshape(-1)
         for band in bands(flat.size, 1, BAND):
             size = band.stop - band.start
             with session.output(out[band]) as buffer:
@@ -92,9 +92,9 @@ class OpenCLOps(Ops):
         sums = session.scratch(rows * width * channels * 4)
         session.clear(sums)
         for band in bands(height, width, BAND):
-            given = [session.input(picture[band]) for picture in pictures]
+            buffers = [session.input(picture[band]) for picture in pictures]
             session.launch(
-                kernel, count, rows, *given, table, sums, count, height, rows, band.start, band.stop
+                kernel, count, rows, *buffers, table, sums, count, height, rows, band.start, band.stop
             )
         mean_cells = self._kernel("mean_cells")
         with session.output(result.light) as light, session.output(result.mask) as specified:
@@ -108,22 +108,22 @@ class OpenCLOps(Ops):
             return result
         plan, columns = draw.plan(strokes, size), -(-width // draw.TILE)
         kernel = self._kernel("draw")
-        given = [session.input(array) for array in (plan.segments, plan.lights, plan.first, plan.entries)]
+        buffers = [session.input(array) for array in (plan.segments, plan.lights, plan.first, plan.entries)]
         for band in bands(height, width, BAND):
             with session.output(result.light[band]) as light, session.output(result.mask[band]) as mask:
                 session.launch(
-                    kernel, columns, band.stop - band.start, *given, light, mask, width, columns, band.start
+                    kernel, columns, band.stop - band.start, *buffers, light, mask, width, columns, band.start
                 )
         return result
 
     def _coarsen(self, lumi: FloatArray, lattice: Lattice) -> Strokes:
         session, (height, width), (rows, columns) = self._session, lumi.shape[:2], lattice.keep.shape
         result = Strokes(np.empty(lumi.shape, np.float32), np.empty((height, width), np.float32))
-        given = session.input(lumi), session.input(lattice.keep.astype(np.uint8))
+        buffers = session.input(lumi), session.input(lattice.keep.astype(np.uint8))
         place = lattice.cell, lattice.oy, lattice.ox
         with session.output(result.light) as light, session.output(result.mask) as mask:
             kernel = self._kernel("coarsen")
-            session.launch(kernel, columns, rows, *given, light, mask, height, width, *place, columns)
+            session.launch(kernel, columns, rows, *buffers, light, mask, height, width, *place, columns)
         return result
 
     def _cut(self, lumi: FloatArray, discs: Discs) -> Strokes:
@@ -146,13 +146,13 @@ class OpenCLOps(Ops):
         narrow = width < columns * session.lanes * FEW
         kernel = self._kernel("transfer_narrow" if narrow else "transfer", photo.dtype)
         light = _by_pixel(nodes, width) if narrow else (nodes,)
-        given = [*map(session.input, light), *tables]
+        buffers = [*map(session.input, light), *tables]
         count, sides = (width, ()) if narrow else (columns, (columns,))
         for band in bands(height, width, BAND):
             with session.output(result[band]) as out:
                 place = height, width, rows, *sides, band.start
                 taken = session.input(photo[band])
-                session.launch(kernel, count, band.stop - band.start, taken, *given, out, *place)
+                session.launch(kernel, count, band.stop - band.start, taken, *buffers, out, *place)
         return result
 
     def _kernel(self, name: str, dtype: npt.DTypeLike = np.uint8, **defines: str) -> cl.Kernel:

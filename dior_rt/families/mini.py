@@ -92,7 +92,7 @@ class Graphs:
 
     def __init__(self, encode: Engine, velocity: Engine) -> None:
         self.encode, self.velocity = encode, velocity
-        self._blank, self._own_light = lru_cache(1)(self._look), lru_cache(1)(self._estimate)
+        self._blank, self._source_light = lru_cache(1)(self._look), lru_cache(1)(self._estimate)
 
     def guided(self, condition: Condition, guidance: float) -> Velocity:
         """The velocity under a condition, and guided away from none: see `dior_rt.flow.sampler.guided`."""
@@ -114,7 +114,7 @@ class Graphs:
         photo = seen["photo"].shape, seen["photo"].tobytes()
         blank = drawn = self._blank(*photo)
         if seen["mask"].any():
-            drawn = self.encode.run({**seen, "own": self._own_light(*photo)})
+            drawn = self.encode.run({**seen, "own": self._source_light(*photo)})
         return {**mode, **drawn}, {**mode, **blank}
 
     def _look(self, shape: tuple[int, ...], photo: bytes) -> Condition:

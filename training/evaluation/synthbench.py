@@ -80,13 +80,13 @@ def render_synthbench(
     make_folder(out)
     _agree(out / HEAD, recipe)
     index, shards = shard
-    mine = range(index, recipe.pairs, shards)
-    for done, number in enumerate(mine):
+    numbers = range(index, recipe.pairs, shards)
+    for done, number in enumerate(numbers):
         folder = out / f"{number:04d}"
         if not (folder / LAST).exists():
             _save(folder, make(number, recipe))
         if progress:
-            progress(done + 1, len(mine))
+            progress(done + 1, len(numbers))
 
 
 def make(number: int, recipe: Recipe) -> Task:

@@ -42,7 +42,7 @@ from dior_rt.training.fit import Plan, fit, fit_lora
 from dior_rt.training.network import LORA, WEIGHTS, Config, load_network
 from dior_rt.training.stage2 import Scene, fit_stage2, load_scenes
 
-Told = Callable[[str, int, float], None]  # the name of the training, the step, the running loss
+TrainingProgress = Callable[[str, int, float], None]  # the name of the training, the step, the running loss
 
 PAIRS: Final = ("replace", "change")  # of every held-out view
 STILL: Final = ("keep",)  # pictures for the brush: nothing changes
@@ -99,7 +99,7 @@ def ablate(
     renders: Path,
     out: Path,
     budget: Budget = Budget(),
-    progress: Told | None = None,
+    progress: TrainingProgress | None = None,
 ) -> tuple[Evaluation, list[Example]]:
     """Train every row into the folder `out` and judge it. Rows that are already trained are kept.
 
@@ -117,14 +117,14 @@ def train(
     photos: list[Scene],
     out: Path,
     budget: Budget,
-    progress: Told | None = None,
+    progress: TrainingProgress | None = None,
 ) -> Network:
     """Return a row's network after stage 1 and the LoRA. Rows of the same map share their stage 1."""
     stage1 = out / f"stage1-{row.kind}"
     lora = out / f"{'stage2' if row.stage2 else 'lora'}-{row.kind}"
-    tell = progress or (lambda training, step, loss: None)
-    fit(views, stage1, budget.config, budget.stage1, partial(tell, f"{row.kind}, stage 1"))
-    show = partial(tell, f"{row.kind}, {lora.name}")
+    show_training = progress or (lambda training, step, loss: None)
+    fit(views, stage1, budget.config, budget.stage1, partial(show_training, f"{row.kind}, stage 1"))
+    show = partial(show_training, f"{row.kind}, {lora.name}")
     if row.stage2:
         make = partial(MiniLora, stage1 / WEIGHTS, budget.rank, lora)
         fit_stage2(make, views, photos, lora, budget.lora, progress=show)
@@ -192,19 +192,21 @@ def judge(networks: Mapping[Condition, Network], held_out: Path) -> tuple[Evalua
     rows, bounds, brush, examples = [], [copied], [], []
     first: dict[str, Scores] = {}
     for row, network in networks.items():
-        own = tasks(held_out, row.kind, PAIRS)
-        check_same_pictures(own, lamps)
-        for control, strokes in controls(own, lamps).items():
-            relit = [network.relight(task.source, drawn) for task, drawn in zip(own, strokes, strict=True)]
-            scores = score(relit, own)
+        row_tasks = tasks(held_out, row.kind, PAIRS)
+        check_same_pictures(row_tasks, lamps)
+        for control, strokes in controls(row_tasks, lamps).items():
+            relit = [
+                network.relight(task.source, drawn) for task, drawn in zip(row_tasks, strokes, strict=True)
+            ]
+            scores = score(relit, row_tasks)
             ahead = np.subtract(scores["PSNR"], first.setdefault(control, scores)["PSNR"]).tolist()
             rows.append(Row(row.name, control, figures({**scores, AHEAD: ahead}), None))
             if control == "strokes":
-                named = [replace(task, name=f"{task.name}, {row.name}") for task in own]
+                named = [replace(task, name=f"{task.name}, {row.name}") for task in row_tasks]
                 examples += [Example(*each) for each in zip(named, strokes, relit, strict=True)][:EXAMPLES]
         if row.stage2:
-            known = figures(score(quotients(own), own))
-            bounds.append(Row("quotient", f"both of kind {row.kind}", known, None))
+            quotient_figures = figures(score(quotients(row_tasks), row_tasks))
+            bounds.append(Row("quotient", f"both of kind {row.kind}", quotient_figures, None))
         for control, kind in DABS.items():
             still = tasks(held_out, kind or row.kind, STILL, seed=3)
             brush.append(Row(row.name, control, figures(follow(network, still)), None))
@@ -225,17 +227,17 @@ def tasks(held_out: Path, kind: str, pairs: Sequence[str], seed: int = 1) -> lis
     return [task for benchmark in found for task in benchmark]
 
 
-def check_same_pictures(own: Sequence[Task], others: Sequence[Task]) -> None:
+def check_same_pictures(row_tasks: Sequence[Task], others: Sequence[Task]) -> None:
     """Raise InputError if tasks differ in more than their maps."""
-    for one, other in zip(own, others, strict=True):
+    for one, other in zip(row_tasks, others, strict=True):
         same = one.name == other.name and np.array_equal(one.source, other.source)
         if not (same and np.array_equal(one.truth, other.truth)):
             raise InputError(f"The maps of {other.name} show different pictures; render the maps again.")
 
 
-def controls(own: Sequence[Task], lamps: Sequence[Task]) -> dict[str, list[Strokes]]:
+def controls(row_tasks: Sequence[Task], lamps: Sequence[Task]) -> dict[str, list[Strokes]]:
     """Return the control of a row by name: its full map, strokes cut from it, and strokes of the Lumi map."""
-    drawn: dict[str, list[Strokes]] = {name: [task.control(name) for task in own] for name in DRAWN}
+    drawn: dict[str, list[Strokes]] = {name: [task.control(name) for task in row_tasks] for name in DRAWN}
     return {**drawn, LAMPS: [task.control("strokes") for task in lamps]}
 
 

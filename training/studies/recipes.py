@@ -60,7 +60,7 @@ def walks(noise: float) -> tuple[Walk, ...]:
 class Recipe:
     """A row.
 
-    silent, always_noise, noise: as in `Plan`. share: its part of the cost.
+    noiseless, always_noise, noise: as in `Plan`. share: its part of the cost.
     after: the recipe that is trained before and continued. about: `after` stays frozen, and the flow models
     the difference to its answer.
     patch, widen: the network's patch, and the factor of its width.
@@ -69,7 +69,7 @@ class Recipe:
     """
 
     name: str
-    silent: float = Plan.silent
+    noiseless: float = Plan.noiseless
     always_noise: float = Plan.always_noise
     noise: float = Plan.noise
     share: float = 1.0
@@ -88,18 +88,20 @@ class Recipe:
         return replace(small, patch=self.patch, width=self.widen * small.width)
 
 
-HALF: Final = Recipe("half a regression", silent=1, always_noise=1, share=0.5)
+HALF: Final = Recipe("half a regression", noiseless=1, always_noise=1, share=0.5)
 RECIPES: Final = (
     Recipe("what ships", walks=(*walks(1), Walk(20))),
-    Recipe("noise start", silent=0, always_noise=0, walks=walks(1)),
-    Recipe("noise start, sigma mostly 1", silent=0, walks=walks(1)),
-    Recipe("regression", silent=1, always_noise=1),
-    Recipe("regression, then noise start", silent=0, always_noise=0, share=0.5, after=HALF, walks=walks(1)),
-    Recipe("bridge from the photo, noise 0.25", silent=0, always_noise=0, noise=0.25, walks=walks(0.25)),
-    Recipe("bridge from the photo, no noise", silent=1, always_noise=0, walks=(ONCE, Walk(4), Walk(20))),
+    Recipe("noise start", noiseless=0, always_noise=0, walks=walks(1)),
+    Recipe("noise start, sigma mostly 1", noiseless=0, walks=walks(1)),
+    Recipe("regression", noiseless=1, always_noise=1),
+    Recipe(
+        "regression, then noise start", noiseless=0, always_noise=0, share=0.5, after=HALF, walks=walks(1)
+    ),
+    Recipe("bridge from the photo, noise 0.25", noiseless=0, always_noise=0, noise=0.25, walks=walks(0.25)),
+    Recipe("bridge from the photo, no noise", noiseless=1, always_noise=0, walks=(ONCE, Walk(4), Walk(20))),
     Recipe(
         "estimate, then a flow about it",
-        silent=0,
+        noiseless=0,
         always_noise=0,
         share=0.5,
         after=HALF,
@@ -134,10 +136,10 @@ def study(
     plans = at_equal_cost(plan, small, recipes)
     trained: dict[Recipe, nn.Module] = {}
     before = 0  # steps of the rows before this one
-    for recipe, own in plans.items():
-        tell = None if progress is None else partial(_told, progress, before)
-        trained[recipe] = train(recipe, own, small, trained, batches.after(plans, recipe), out, tell)
-        before += own.steps
+    for recipe, row_plan in plans.items():
+        show = None if progress is None else partial(_show_total, progress, before)
+        trained[recipe] = train(recipe, row_plan, small, trained, batches.after(plans, recipe), out, show)
+        before += row_plan.steps
     rows = {recipe: trained[recipe] for recipe in recipes}
     costs = {recipe: cost(recipe, plans, small) for recipe in recipes}
     return judge(rows, costs, tasks, still)
@@ -145,10 +147,10 @@ def study(
 
 def total_steps(plan: Plan = PLAN, small: Config = SMALL, recipes: Sequence[Recipe] = RECIPES) -> int:
     """Return the steps of all rows and of the recipes trained before them."""
-    return sum(own.steps for own in at_equal_cost(plan, small, recipes).values())
+    return sum(row_plan.steps for row_plan in at_equal_cost(plan, small, recipes).values())
 
 
-def _told(progress: Progress, before: int, step: int, loss: float) -> None:
+def _show_total(progress: Progress, before: int, step: int, loss: float) -> None:
     progress(before + step, loss)
 
 
@@ -170,7 +172,7 @@ def at_equal_cost(plan: Plan, small: Config, recipes: Sequence[Recipe]) -> dict[
         recipe: replace(
             plan,
             steps=max(round(recipe.share * whole / step_cost(_blank(recipe, small), plan)), 1),
-            silent=recipe.silent,
+            noiseless=recipe.noiseless,
             always_noise=recipe.always_noise,
             noise=recipe.noise,
         )
@@ -185,17 +187,17 @@ def step_cost(network: nn.Module, plan: Plan) -> int:
     batch = {name: planes for name in ("photo", "light", "x0", "own")}
     batch |= {"mask": planes[:, :1], "mode": torch.zeros(count, dtype=torch.int64)}
     with FlopCounterMode(display=False) as counted:
-        flow_loss(network, batch, torch.ones(count), planes, plan.own).backward()
+        flow_loss(network, batch, torch.ones(count), planes, plan.source_weight).backward()
     return int(counted.get_total_flops())
 
 
 def cost(recipe: Recipe, plans: Mapping[Recipe, Plan], small: Config) -> Cost:
     """Return the cost of a row, including the recipe trained before it."""
-    own, network = plans[recipe], _blank(recipe, small)
+    row_plan, network = plans[recipe], _blank(recipe, small)
     earlier = cost(recipe.after, plans, small) if recipe.after else Cost(0, 0, 0)
     weights = sum(weight.numel() for weight in network.parameters())
-    flops = own.steps * step_cost(network, own)
-    return Cost(earlier.samples + own.steps * own.batch, weights, earlier.flops + flops)
+    flops = row_plan.steps * step_cost(network, row_plan)
+    return Cost(earlier.samples + row_plan.steps * row_plan.batch, weights, earlier.flops + flops)
 
 
 @dataclass(frozen=True)

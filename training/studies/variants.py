@@ -22,23 +22,23 @@ class AboutEstimate(nn.Module):
         self.estimate, self.flow = deepcopy(estimate).requires_grad_(False), flow
 
     def forward(
-        self, x: Tensor, sigma: Tensor, with_own: bool = False, **seen: Tensor
+        self, x: Tensor, sigma: Tensor, with_source: bool = False, **seen: Tensor
     ) -> Tensor | tuple[Tensor, Tensor]:
         """Return what `Mini` returns. seen: photo, light, mask and mode."""
         middle = -self.estimate(x=torch.zeros_like(x), sigma=torch.ones_like(sigma), **seen)
         s = sigma[:, None, None, None]
-        towards, own = self.flow(x=x - (1 - s) * middle, sigma=sigma, with_own=True, **seen)
+        towards, source = self.flow(x=x - (1 - s) * middle, sigma=sigma, with_source=True, **seen)
         # A velocity is linear in the state and in the expected answer, from which `middle` is subtracted.
         towards = towards - velocity(torch.zeros_like(x), s, middle) - middle
-        return (towards, own) if with_own else towards
+        return (towards, source) if with_source else towards
 
 
 def sever(network: Mini) -> None:
     """Restrict all layers after the transformer to their own cell, now and in training."""
     network.mix = nn.Identity()
     for layer in (network.blend_quarter.blend, network.blend_half.blend, network.smooth, network.head):
-        own = torch.zeros(layer.kernel_size)
-        own[1, 1] = 1
+        centre = torch.zeros(layer.kernel_size)
+        centre[1, 1] = 1
         with torch.no_grad():
-            layer.weight *= own
-        layer.weight.register_hook(own.mul)  # masks the gradient, so AdamW keeps the zeros
+            layer.weight *= centre
+        layer.weight.register_hook(centre.mul)  # masks the gradient, so AdamW keeps the zeros
