@@ -112,7 +112,8 @@ class Qwen:
         if fixed:
             if steps != len(fixed):
                 raise InputError(
-                    f"This model was exported for {len(fixed)} steps, not {steps}; export it with --free-steps."
+                    f"This model was exported for {len(fixed)} steps, not {steps}; "
+                    "export it with --free-steps."
                 )
             return np.array([*fixed, 0], np.float32)
         if isinstance(self._schedule, DynamicShiftSchedule):
@@ -202,7 +203,9 @@ class Qwen:
         fixed = self.settings.fixed_sigmas
         if self._table is not None:
             if len(sigmas) != len(fixed) or np.abs(sigmas - np.array(fixed)).max() > SAME_SIGMA:
-                raise InputError("This model has no modulation for these sigmas; export it with --free-steps.")
+                raise InputError(
+                    "This model has no modulation for these sigmas; export it with --free-steps."
+                )
             return self._table
         key = sigmas.tobytes()
         if key not in self._computed:
