@@ -38,8 +38,8 @@ class SamplingOptions:
 
         Raises TypeError for a name that is no field.
         """
-        given = SamplingOptions(**fields)
-        return replace(self, **{name: value for name, value in vars(given).items() if value is not None})
+        changes = SamplingOptions(**fields)
+        return replace(self, **{name: value for name, value in vars(changes).items() if value is not None})
 
 
 DEFAULTS: Final = SamplingOptions()
@@ -125,6 +125,6 @@ def _find_preset(bundle: Bundle, name: str) -> Preset:
         return Preset(bundle.manifest.steps)
     presets = read_presets(bundle)
     if name not in presets:
-        known = ", ".join((REFERENCE, *presets))
-        raise InputError(f"The model {bundle.manifest.name} has no preset {name!r}, only: {known}.")
+        names = ", ".join((REFERENCE, *presets))
+        raise InputError(f"The model {bundle.manifest.name} has no preset {name!r}, only: {names}.")
     return presets[name]

@@ -1,4 +1,4 @@
-"""What OpenCL devices there are, and the choice among them. pyopencl is imported only on demand."""
+"""List the OpenCL devices and choose among them. pyopencl is imported only when needed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dior_rt.kernels.types import Device, KernelError
 
 
 def list_devices() -> list[Device]:
-    """Every OpenCL device, in the platforms' order. Raises KernelError where there is no OpenCL at all."""
+    """Return every OpenCL device in the order of the platforms. Raises KernelError without OpenCL."""
     prepare_caches()
     try:
         import pyopencl as cl
@@ -41,11 +41,12 @@ def list_devices() -> list[Device]:
 
 
 def prepare_caches() -> None:
-    """Have PoCL and pyopencl keep what they compile in a folder that is writable and nobody else's.
+    """Make PoCL and pyopencl keep compiled kernels in a writable folder that belongs to this user.
 
-    PoCL would use ~/.cache/pocl/kcache, have no device at all where that cannot be written, and, without a
-    HOME, load code from /tmp/pocl, which anyone may have put there. Its last resort here is a temporary
-    folder of this process; pyopencl's is to cache nothing. To be called before pyopencl is imported."""
+    By default, PoCL uses ~/.cache/pocl/kcache. It has no device if that folder is not writable, and without a
+    HOME it loads code from /tmp/pocl, which anyone can write. Here, PoCL falls back to a temporary folder
+    of this process, and pyopencl to no cache. Call this before pyopencl is imported.
+    """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home, "pocl", "kcache")
@@ -60,12 +61,13 @@ def prepare_caches() -> None:
 
 
 def open_ops(name: str = "auto") -> Ops:
-    """The Ops of that name, see `open_device`; `reason` says why it was chosen.
+    """Return the Ops of that name. Its `reason` says why it was chosen.
 
     "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose
-    name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that
-    cannot be opened gives way to the next, and one that fails later to NumPy; the reason says so. Raises
-    KernelError where what was named cannot be had."""
+    name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto", a device that
+    cannot be opened is skipped, and NumPy replaces a device that fails later; the reason says so. Raises
+    KernelError if a named device is not available.
+    """
     if name == "numpy":
         return NumpyOps()
     if name == "auto":
@@ -77,28 +79,30 @@ def open_ops(name: str = "auto") -> Ops:
     if which:
         devices = [device for device in devices if _answers_to(device, which)]
     if not devices:
-        raise KernelError(f"no OpenCL device answers to {name!r}")
+        raise KernelError(f"there is no OpenCL device {name!r}; `dior-rt devices` lists them")
     return open_device(devices[0])
 
 
 def open_device(device: Device, spare: Ops | None = None) -> GuardedOps:
-    """The Ops of one device. An operation is tried before its first use; where it fails, `spare` takes over.
+    """Return the Ops of one device. Each operation is tested before its first use; `spare` replaces it if
+    it fails.
 
-    Raises KernelError if the device cannot be opened, or fails what every 8-bit photo needs first."""
+    Raises KernelError if the device cannot be opened, or fails the first operation of every 8-bit photo.
+    """
     from dior_rt.kernels.opencl_ops import OpenCLOps
 
     return GuardedOps(OpenCLOps(device), spare)
 
 
 def check_device(device: Device) -> None:
-    """Try every operation on a device. Raises KernelError that says what is wrong with it."""
+    """Test every operation on a device. Raises KernelError that says what is wrong."""
     from dior_rt.kernels.opencl_ops import OpenCLOps
 
     self_test(OpenCLOps(device))
 
 
 def by_preference(devices: list[Device]) -> list[Device]:
-    """GPUs first, then CPUs, then the rest; otherwise in the platforms' order."""
+    """Sort GPUs first, then CPUs, then the rest, each in the order of the platforms."""
     order = {"gpu": 0, "cpu": 1}
     return sorted(devices, key=lambda device: order.get(device.type, 2))
 
@@ -125,7 +129,7 @@ def _choose_best() -> Ops:
 
 
 def _devices(platform: Any) -> list[Any]:
-    """A platform's devices; one that has none says so with an error."""
+    """Return a platform's devices. A platform without devices raises an error, so return none then."""
     import pyopencl as cl
 
     try:

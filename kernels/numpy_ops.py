@@ -1,4 +1,4 @@
-"""The NumPy twin of every kernel: what runs where there is no OpenCL, and what OpenCL is compared against."""
+"""Every operation in NumPy: used without OpenCL, and as the reference of the self-tests."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA, rough_reciprocal
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
-#: Pixels in a band: what is worked on at a time stays in the processor's cache.
+#: Pixels in a band, so that a band stays in the processor's cache.
 BAND = 1 << 16
 
 
 class NumpyOps(Ops):
-    """Vectorised NumPy, in bands of rows."""
+    """The operations in vectorised NumPy, in bands of rows."""
 
     name = "numpy"
 
@@ -93,7 +93,7 @@ class NumpyOps(Ops):
         row, down = spline_taps(height, nodes.shape[0] - 2)
         column, across = spline_taps(width, nodes.shape[1] - 2)
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
-        # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane a quantity.
+        # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane per quantity.
         near_columns = [np.ascontiguousarray(np.moveaxis(nodes[:, column + m], 2, 0)) for m in range(3)]
         for rows in bands(height, width, BAND):
             lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1) / np.float32(SIGMA)
@@ -112,7 +112,7 @@ class NumpyOps(Ops):
 
 
 def _weighted(light: Picture, mask: Picture) -> FloatArray:
-    """(rows, W, 4): light * mask and mask, with 0 for the light that the mask leaves unspecified."""
+    """Return light * mask and mask, (rows, W, 4), with 0 for light that the mask leaves unspecified."""
     if mask.dtype != np.float32:
         mask = mask * np.float32(1 / np.iinfo(mask.dtype).max)
     linear = light if light.dtype == np.float32 else decode_table(light.dtype)[light]
@@ -121,7 +121,7 @@ def _weighted(light: Picture, mask: Picture) -> FloatArray:
 
 
 def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int, size: Grid) -> None:
-    """Blend one stroke over a picture's band that starts at row `top`; light holds value * mask."""
+    """Blend one stroke over a band that starts at row `top`. light holds value * mask."""
     ends, margin = draw.segments(stroke, size), draw.radius(stroke) + 1
     if len(ends) == 0:
         return
@@ -143,7 +143,7 @@ def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int, siz
 
 
 def _window(points: FloatArray, margin: float, top: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The rows and columns of a band that come within `margin` of the box of some points (x, y)."""
+    """Return the rows and columns of a band that are within `margin` of the bounding box of points (x, y)."""
     low = np.floor(points.min(0) - margin) - (0, top)
     high = np.ceil(points.max(0) + margin) - (0, top)
     (left, above), (right, below) = (np.clip(edge, 0, shape[::-1]).astype(int) for edge in (low, high))

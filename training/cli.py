@@ -349,12 +349,12 @@ def ablation(
     stage1 = replace(budget.stage1, steps=steps, batch=batch, precision=precision, seed=seed)
     lora = replace(budget.lora, steps=lora_steps, batch=batch, precision=precision, seed=seed + 1)
 
-    def tell(training: str, step: int, loss: float) -> None:
+    def show(training: str, step: int, loss: float) -> None:
         if step % 50 == 0:
             typer.echo(f"{training}: step {step}, loss {loss:.4f}", err=True)
 
     budget = replace(budget, stage1=stage1, lora=lora)
-    evaluation, examples = ablate(maps, held_out, renders, out, budget, tell)
+    evaluation, examples = ablate(maps, held_out, renders, out, budget, show)
     write_report(out, evaluation, examples)
     typer.echo(markdown(evaluation))
 

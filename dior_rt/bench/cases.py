@@ -1,4 +1,4 @@
-"""Cases to measure presets with: photos that are made by arithmetic, and strokes on them."""
+"""Cases to measure presets with: synthetic photos, and strokes on them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OPS = NumpyOps()
 
 @dataclass(frozen=True)
 class Case:
-    """photo: (H, W, 3) uint8, sRGB. strokes: of its size. seed: of the noise."""
+    """A photo (H, W, 3), uint8, sRGB, with strokes of the same size and a seed for the noise."""
 
     photo: NDArray[np.uint8]
     strokes: Strokes
@@ -24,7 +24,7 @@ class Case:
 
 
 def made_up(count: int) -> list[Case]:
-    """Balls before a textured wall under one light, and strokes of any colour and strength."""
+    """Return synthetic cases: balls before a textured wall, and strokes of random colour and strength."""
     return [_made_up(np.random.default_rng([number, 71]), number) for number in range(count)]
 
 

@@ -155,9 +155,9 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
     yield Answer("copy", "", task.source)
     yield Answer("gain", "target's colours", gain(task.source, task.truth))
     yield Answer("mean and deviation", "target's colours", match(task.source, task.truth))
-    for maps, known in (("true maps", task), ("estimated maps", estimated)):
-        if known and known.source_lumi is not None and known.target_lumi is not None:
-            yield Answer("quotient", maps, quotient(task.source, known.source_lumi, known.target_lumi))
+    for maps, lit_task in (("true maps", task), ("estimated maps", estimated)):
+        if lit_task and lit_task.source_lumi is not None and lit_task.target_lumi is not None:
+            yield Answer("quotient", maps, quotient(task.source, lit_task.source_lumi, lit_task.target_lumi))
     if isinstance(method, Pictures):
         strokes = task.control("strokes") if task.target_lumi is not None else None
         yield Answer(method.name, "", method.picture(task), strokes=strokes)
