@@ -59,6 +59,12 @@ def check_writable(path: Path) -> None:
         raise InputError(f"Cannot write {path}: {reason(error)}.") from error
 
 
+def check_free(path: Path, overwrite: bool) -> None:
+    """Raise InputError where a file is there already, unless it may be replaced."""
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} is there already. Give --overwrite to replace it, or name another file.")
+
+
 def check_readable(path: Path, what: str) -> None:
     """Raise InputError unless `path` is a regular file that can be opened. what: "photo", "strokes" ..."""
     try:

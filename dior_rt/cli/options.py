@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from fractions import Fraction
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -25,7 +25,7 @@ def _finite(value: float | None) -> float | None:
     return value
 
 
-Photo = Annotated[Path, typer.Argument(metavar="PHOTO", help="A PNG, JPEG, TIFF or WebP picture.")]
+Photo = Annotated[Path, typer.Argument(metavar="PHOTO", help="A PNG, JPEG, TIFF or WebP picture ...")]
 Bundle = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="The model [default: the one that ships with dior-rt].")
 ]
@@ -84,5 +84,11 @@ Reach = Annotated[
         "lamp and leaves the rest [default: as far as the model takes it].",
     ),
 ]
+Format = Annotated[
+    Literal["png", "jpg", "tif", "webp"] | None,
+    typer.Option(help="The kind of file to write [default: by the name of OUT, else png]."),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a result that is there already.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object that says what was done.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
