@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +32,15 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     finally:
         with contextlib.suppress(OSError):
             draft.unlink()
+
+
+def remove_drafts(path: Path) -> None:
+    """Remove what `replacing(path)` left behind where its process was killed."""
+    name = f".{path.name[:100]}."
+    with contextlib.suppress(OSError):
+        for draft in path.parent.iterdir():
+            if draft.name.startswith(name) and re.fullmatch("[0-9a-f]{8}", draft.name[len(name) :]):
+                draft.unlink()
 
 
 def make_folder(path: Path) -> None:

@@ -123,7 +123,15 @@ def relight(
     write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
     watch.lap("write")
     notices = [*picture.notices, *([relit.notice] if relit.notice else [])]
-    _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, [] if quiet else notices, as_json)
+    _report(
+        out,
+        picture.size,
+        settings,
+        watch.seconds | relit.seconds,
+        relighter,
+        [] if quiet else notices,
+        as_json,
+    )
 
 
 def estimate(

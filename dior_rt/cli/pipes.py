@@ -80,7 +80,7 @@ def _spool(folder: Path) -> Path:
 
 
 def suffix_of(head: bytes) -> str:
-    """The suffix that fits a file's first bytes; pictures are recognised by their content, so ".png" will do."""
+    """The suffix that fits a file's first bytes; ".png" for pictures, which are told apart later."""
     signatures = {b"\x76\x2f\x31\x01": ".exr", b"\x93NUMPY": ".npy", b"PK\x03\x04": ".dior"}
     for signature, suffix in signatures.items():
         if head.startswith(signature):

@@ -223,7 +223,12 @@ def test_devices_names_what_the_options_take(mini_bundle: Path, folder: Path, ca
     assert report["network"]["auto"]["reason"] and report["ops"]["auto"]["reason"]
     common = ["--bundle", str(mini_bundle), "--steps", "1"]
     for ops in usable["ops"]:
-        assert run(["relight", "photo.png", "strokes.png", *common, "--ops", ops, "-o", "out.png", "--overwrite"]) == 0
+        assert (
+            run(
+                ["relight", "photo.png", "strokes.png", *common, "--ops", ops, "-o", "out.png", "--overwrite"]
+            )
+            == 0
+        )
     capfd.readouterr()
 
     assert run(["devices", "--bundle", str(mini_bundle)]) == 0

@@ -49,7 +49,19 @@ def test_strokes_of_every_kind_come_from_standard_input(folder, model, stdin) ->
 
 def test_a_whole_pipe_of_processes(expected, model) -> None:
     result = subprocess.run(
-        [sys.executable, "-m", "dior_rt", "relight", "-", "strokes.png", "-o", "-", "--format", "tif", *model],
+        [
+            sys.executable,
+            "-m",
+            "dior_rt",
+            "relight",
+            "-",
+            "strokes.png",
+            "-o",
+            "-",
+            "--format",
+            "tif",
+            *model,
+        ],
         input=Path("photo.png").read_bytes(),
         capture_output=True,
         check=True,
