@@ -22,7 +22,14 @@ from dior_rt.families.qwen.model import Qwen
 from dior_rt.flow.adaptive import sample_within
 from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.flow.schedule import ShiftSchedule
-from dior_rt.images.arrays import Picture, check_same_shape, like_photo, read_pixels, read_strokes
+from dior_rt.images.arrays import (
+    Picture,
+    check_same_shape,
+    in_primaries_of,
+    like_photo,
+    read_pixels,
+    read_strokes,
+)
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
@@ -134,7 +141,8 @@ class Relighter:
     ) -> Relit:
         """The photo under the light of the strokes.
 
-        photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
+        photo: a Pillow image, which is read as its file would be (upright by its EXIF, in the colours of its
+        profile); or an array (H, W, 3), sRGB, of uint8, uint16, or float32 in 0..1.
         strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
         sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
         Stroke, in pixels of the photo.
@@ -163,9 +171,11 @@ class Relighter:
         watch = Stopwatch()
         pixels = read_pixels(photo)
         raster = self._family.raster(*pixels.shape[:2])
-        drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
+        drawn = self._reduce_strokes(in_primaries_of(photo, strokes), pixels.shape[:2], raster, intensity)
         if not drawn.mask.any():
-            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
+            return Relit(
+                like_photo(pixels.copy(), photo), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach
+            )
         source, encoded = self._reduce_photo(pixels, raster)
         watch.lap("kernels")
         condition = self._family.encode(encoded, drawn, "relight")

@@ -84,5 +84,9 @@ Reach = Annotated[
         "lamp and leaves the rest [default: as far as the model takes it].",
     ),
 ]
+Page = Annotated[
+    int,
+    typer.Option(min=0, max=999, help="Which page of STROKES is read where it has several; 0 is the first."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object that says what was done.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

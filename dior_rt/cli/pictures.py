@@ -51,8 +51,10 @@ def relight(
     intensity: options.Intensity = 1.0,
     reach: options.Reach = None,
     key: Annotated[
-        Literal["black"] | None, typer.Option(help="Read what is exactly black in STROKES as unspecified.")
+        Literal["black"] | None,
+        typer.Option(help="Read what is exactly black in STROKES as unspecified; not for JPEG."),
     ] = None,
+    page: options.Page = 0,
     as_json: options.Json = False,
     debug: options.Debug = False,
 ) -> None:
@@ -70,7 +72,7 @@ def relight(
     One more lamp, and the rest of the photo as it is:
       dior-rt relight photo.jpg strokes.png --reach 0.1
     A picture whose black means "not drawn":
-      dior-rt relight photo.jpg light.jpg --key black
+      dior-rt relight photo.jpg light.png --key black
     Fast, or within half a level of 255 of what all the steps would give:
       dior-rt relight photo.jpg strokes.png --preset fast
       dior-rt relight photo.jpg strokes.png --tolerance 0.5/255
@@ -79,21 +81,21 @@ def relight(
     import numpy as np
 
     from dior_rt.images.photo import check_output, read_photo, write_photo
-    from dior_rt.images.strokes import read_strokes
+    from dior_rt.images.strokes import read_drawing
 
     out = out or photo.with_name(f"{photo.stem}-relit.png")
     _refuse_same(out, photo, strokes)
     with _loading(bundle, device, ops) as load:
         picture = read_photo(photo)
         check_output(out, picture)
-        drawing = read_strokes(strokes, picture.size, key)
+        drawing = read_drawing(strokes, picture.size, key, page, picture.primaries)
         watch.lap("read")
         relighter = load()
         watch.lap("load")
     with _progress("Relighting") as advance:
         relit = relighter.relight(
             picture.pixels,
-            drawing,
+            drawing.strokes,
             preset=preset,
             steps=steps,
             solver=solver,
@@ -114,9 +116,14 @@ def relight(
         "intensity": relit.intensity,
         "reach": relit.reach,
     }
-    write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
+    lost = write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
     watch.lap("write")
-    notices = [*picture.notices, *([relit.notice] if relit.notice else [])]
+    notices = [
+        *(f"{photo}: {notice}" for notice in picture.notices),
+        *(f"{strokes}: {notice}" for notice in drawing.notices),
+        *([relit.notice] if relit.notice else []),
+        *lost,
+    ]
     _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, notices, as_json)
 
 
@@ -159,7 +166,7 @@ def estimate(
         lumi = relighter.estimate(picture.pixels, steps=steps, seed=seed, progress=watch.first_step(advance))
     watch.lap("estimate")
     settings = _settings(relighter) | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
-    write_lumi(out, lumi, settings)
+    write_lumi(out, lumi, settings, picture.primaries)
     watch.lap("write")
     _report(out, lumi.shape[:2], settings, watch.seconds, relighter, picture.notices, as_json)
 
@@ -169,7 +176,7 @@ def sparsify(
         Path, typer.Argument(metavar="LUMI", help="A dense Lumi map: EXR or NPY, or a picture of one.")
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="STROKES", help="RGBA PNG, or NPY to keep all.")
+        Path, typer.Option("--out", "-o", metavar="STROKES", help="RGBA PNG, or NPY or EXR to keep all.")
     ],
     mode: Annotated[
         Literal["strokes", "coarse", "dense"], typer.Option(help="How much of the map is kept, and how.")
@@ -192,7 +199,7 @@ def sparsify(
     strokes = NumpyOps().sparsify(read_lumi(lumi), mode, seed)
     write_strokes(out, strokes, {"version": __version__, "mode": mode, "seed": seed})
     if out.suffix.lower() == ".png" and (strokes.light[strokes.mask > 0] > 1).any():
-        _say("Light above display white was clipped; a .npy file keeps it.")
+        _say("Light above display white was clipped; a .npy or .exr file keeps it.")
 
 
 class Watch(Stopwatch):

@@ -19,10 +19,11 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Facts:
-    """exif, xmp, iptc: as found. icc: the profile by which the pixels are read, b"" for sRGB. bits: a channel's
-    depth where the file has more than is read, else 0. offset, canvas: where a cut-out picture lies, (right,
-    down) on a canvas of (rows, columns), None where the file does not say. lossy: whether packing changes pixels.
-    turned: whether Pillow turns the picture upright itself, by EXIF. notices: sentences.
+    """exif, xmp, iptc: as found. icc: the profile by which the pixels are read, b"" for sRGB. bits: a
+    channel's depth where the file has more than is read, else 0. offset, canvas: where a cut-out picture
+    lies, (right, down) on a canvas of (rows, columns), None where the file does not say. lossy: whether
+    packing changes pixels. turned: whether Pillow turns the picture upright itself, by EXIF. notices:
+    sentences.
     """
 
     exif: Exif = field(default_factory=Exif)
@@ -38,22 +39,21 @@ class Facts:
 
 
 def read_facts(file: IO[bytes], image: Image.Image, page: int = 0) -> Facts:
-    """The facts of an opened picture of Pillow's. Raises ValueError for colours that cannot be shown (HDR)."""
+    """The facts of an opened picture of Pillow's. Raises ValueError for HDR."""
     reader = {"PNG": _png, "TIFF": _tiff, "AVIF": _boxed, "JPEG2000": _boxed}.get(image.format or "", _plain)
     return reader(file, image, page)
 
 
 def facts_of(image: Image.Image) -> Facts:
-    """The facts of a picture in memory, as far as Pillow passes them on."""
-    if image.format == "TIFF":  # its tags are gone by now, and it stands upright
-        return Facts(
-            xmp=_bytes(image.info.get("xmp")), icc=_bytes(image.info.get("icc_profile")), turned=True
-        )
-    info = image.info
+    """The facts of a loaded picture in memory, as far as Pillow passes them on."""
+    info, is_tiff = image.info, image.format == "TIFF"
+    exif = image.getexif().tobytes() if is_tiff else _bytes(info.get("exif"))
     icc = _bytes(info.get("icc_profile"))
-    if not icc and "gamma" in info and "srgb" not in info:
-        icc = primaries.profile_of_png(struct.pack(">I", round(info["gamma"] * 100_000)), b"")
-    return _common(info, _bytes(info.get("exif")), icc)
+    if not icc and "srgb" not in info and "gamma" in info:
+        whole = [round(value * 100_000) for value in info.get("chromaticity", ())]
+        xy = struct.pack(">8I", *whole) if len(whole) == 8 else b""
+        icc = primaries.profile_of_png(struct.pack(">I", round(info["gamma"] * 100_000)), xy)
+    return _common(info, exif, icc, turned=is_tiff)
 
 
 def _common(info: dict[Any, Any], exif: bytes, icc: bytes, **more: Any) -> Facts:

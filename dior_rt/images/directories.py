@@ -1,7 +1,8 @@
 """TIFF directories, in which EXIF and TIFF files keep their tags: read and written value by value.
 
-Pillow's own reader forgets the types of the values, and a viewer rejects a UserComment of the wrong type. Here
-each value keeps its type and its bytes, in little-endian order. TIFF 6.0, section 2; BigTIFF, libtiff's design.
+Pillow's own reader forgets the types of the values, and a viewer rejects a UserComment of the wrong type.
+Here each value keeps its type and its bytes, in little-endian order. TIFF 6.0, section 2; BigTIFF,
+libtiff's design.
 """
 
 from __future__ import annotations

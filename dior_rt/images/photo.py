@@ -3,7 +3,8 @@
 In: PNG, JPEG (MPO too), TIFF, WebP, GIF, BMP, JPEG 2000, AVIF and PPM. Out: PNG, JPEG, TIFF and WebP, by the
 file's suffix. The orientation that EXIF asks for is carried out; the rest of EXIF is kept (see `metadata`).
 16-bit grey and RGB stay 16-bit (see `sixteen_bit`). An RGB profile is kept with its primaries and honoured in
-its curve (see `icc`); what PNG, AVIF and EXIF say of colour in other ways becomes such a profile (`primaries`); other colour spaces become 8-bit sRGB. JPEG and WebP hold 8 bits, so a 16-bit photo is
+its curve (see `icc`); what PNG, AVIF and EXIF say of colour in other ways becomes such a profile
+(`primaries`); other colour spaces become 8-bit sRGB. JPEG and WebP hold 8 bits, so a 16-bit photo is
 rounded when it is written as such.
 """
 
@@ -26,7 +27,7 @@ from dior_rt.errors import InputError
 from dior_rt.files import check_readable, check_writable, reason, replacing
 from dior_rt.images import xmp
 from dior_rt.images.camera_raw import RAW, is_raw
-from dior_rt.images.containers import read_facts
+from dior_rt.images.containers import facts_of, read_facts
 from dior_rt.images.directories import BYTE, RATIONAL, SHORT, UNDEFINED, entry
 from dior_rt.images.icc import (
     Coloured,
@@ -83,9 +84,10 @@ class Photo:
 
     pixels: (H, W, 3) uint8 or uint16 on the sRGB curve, in the photo's own primaries. alpha: (H, W) of the
     file's depth, or None. curves: what the pixels are taken back to when written, where that is not sRGB's
-    curve. icc, exif, xmp, iptc: as they are written, b"" for none. dpi: dots an inch across and down, or None.
-    notices: sentences about what could not be kept. offset, canvas: where a cut-out picture lies, (right, down)
-    on a canvas of (rows, columns), None where the file does not say. lossy: whether packing changed the pixels.
+    curve. icc, exif, xmp, iptc: as they are written, b"" for none. dpi: dots an inch across and down, or
+    None. notices: sentences about what could not be kept. offset, canvas: where a cut-out picture lies,
+    (right, down) on a canvas of (rows, columns), None where the file does not say. lossy: whether packing
+    changed the pixels.
     """
 
     pixels: Pixels
@@ -100,6 +102,7 @@ class Photo:
     offset: tuple[int, int] = (0, 0)
     canvas: tuple[int, int] | None = None
     lossy: bool = False
+    pages: int = 1
 
     @property
     def primaries(self) -> Matrix:
@@ -163,9 +166,9 @@ def write_photo(
 ) -> tuple[str, ...]:
     """Write a photo whole or not at all, with the settings that made it as JSON in its metadata.
 
-    They stand in XMP, and in a PNG also in the iTXt chunk "Dior". generated: whether XMP says that a model had
-    a hand in the picture. Returns sentences about what the format cannot hold. Raises InputError where the file
-    cannot be written.
+    They stand in XMP, and in a PNG also in the iTXt chunk "Dior". generated: whether XMP says that a model
+    had a hand in the picture. Returns sentences about what the format cannot hold. Raises InputError where
+    the file cannot be written.
     """
     form = _form(path)
     samples = _samples(photo, form)
@@ -244,6 +247,7 @@ def _read(file: IO[bytes], page: int) -> Photo:
         facts.offset,
         facts.canvas,
         facts.lossy,
+        pages,
     )
     orientation = facts.exif.orientation
     if facts.turned:
@@ -296,6 +300,31 @@ def _interpret_deep(
     elif (key := info.get("transparency")) is not None:  # one colour stands for "nothing here"
         alpha = np.where((samples == np.asarray(key)).all(axis=-1), 0, 65535).astype(np.uint16)
     return alpha, interpret(samples, icc)
+
+
+def photo_of(image: Image.Image) -> Photo:
+    """A Pillow image of 8 bits as `read_photo` would read its file. Raises InputError."""
+    try:
+        image.load()
+        facts = facts_of(image)
+        alpha, coloured = interpret_image(image, facts.icc)
+    except (*DAMAGE, MemoryError) as error:
+        raise InputError(f"The image cannot be used: {reason(error)}.") from error
+    photo = Photo(
+        coloured.pixels, alpha, coloured.curves, coloured.icc, facts.exif.kept(), read_dpi(image.info)
+    )
+    return photo if facts.turned else upright(photo, facts.exif.orientation)
+
+
+def image_of(photo: Photo, pixels: Pixels) -> Image.Image:
+    """A Pillow image of 8 bits: other pixels in the photo's own encoding, with its alpha and metadata."""
+    image = Image.fromarray(_samples(photo.with_pixels(pixels), "WEBP"))
+    image.info = {name: value for name, value in _info(photo).items() if value}
+    return image
+
+
+def _info(photo: Photo) -> dict[str, Any]:
+    return {"dpi": photo.dpi, "icc_profile": photo.icc, "exif": photo.exif}
 
 
 def upright(photo: Photo, orientation: int) -> Photo:
@@ -352,8 +381,7 @@ def _metadata(
 
 
 def _save(file: IO[bytes], samples: Pixels, photo: Photo, **options: Any) -> None:
-    optional: dict[str, Any] = {"dpi": photo.dpi, "icc_profile": photo.icc, "exif": photo.exif}
-    given = {name: value for name, value in optional.items() if value}
+    given = {name: value for name, value in _info(photo).items() if value}
     Image.fromarray(samples).save(file, **given, **options)
 
 

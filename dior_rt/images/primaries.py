@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,11 +75,11 @@ def conversion(source: Matrix, target: Matrix) -> Matrix | None:
     return np.linalg.solve(target, source)
 
 
-def convert(light: NDArray[np.float32], matrix: Matrix | None) -> NDArray[np.float32]:
+def convert(light: NDArray[Any], matrix: Matrix | None) -> NDArray[Any]:
     """(..., 3) light by a `conversion`; colours outside the target's gamut are taken to its border, at 0."""
     if matrix is None:
         return light
-    return np.maximum(light @ matrix.T.astype(np.float32), np.float32(0))
+    return np.maximum(light @ matrix.T.astype(light.dtype), light.dtype.type(0))
 
 
 # Profiles

@@ -20,9 +20,9 @@ _MAKERS = ("nikon", "canon", "sony", "pentax", "samsung", "hasselblad", "phase o
 
 @dataclass(frozen=True)
 class TiffFacts:
-    """pages: how many. size: (rows, columns) of the first page. offset: of the page in pixels, right and down.
-    exif, iptc: of the page. is_raw: a camera's raw file. depth: its samples in words, where they cannot be read.
-    lossy: whether its compression changes pixels.
+    """pages: how many. size: (rows, columns) of the first page. offset: of the page in pixels, right and
+    down. exif, iptc: of the page. is_raw: a camera's raw file. depth: its samples in words, where they
+    cannot be read. lossy: whether its compression changes pixels.
     """
 
     pages: int
