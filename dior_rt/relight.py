@@ -32,6 +32,7 @@ from dior_rt.images.arrays import (
 )
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.kernels.types import STRONGEST
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
 from dior_rt.reach import check_reach, within_reach
 from dior_rt.stopwatch import Stopwatch
@@ -225,9 +226,10 @@ class Relighter:
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
         drawn = self._ops.reduce_strokes(light, mask, raster)
-        with np.errstate(over="ignore", invalid="ignore"):
-            drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
-        if not np.isfinite(drawn.light).all():
+        # In float64, which holds the product of any strokes and any intensity that is allowed.
+        light = drawn.light.astype(np.float64) * intensity
+        drawn = Strokes(light.clip(max=STRONGEST).astype(np.float32), drawn.mask)
+        if not light.max() <= STRONGEST:
             raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
         return drawn
 

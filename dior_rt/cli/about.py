@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from dior_rt.cli import options
-from dior_rt.cli.text import table
+from dior_rt.cli.text import say, table
 
 
 def devices(
@@ -33,10 +33,10 @@ def devices(
         "ops": survey_ops(),
     }
     if as_json:
-        typer.echo(json.dumps({kind: unparse(survey) for kind, survey in surveys.items()}, indent=2))
+        say(json.dumps({kind: unparse(survey) for kind, survey in surveys.items()}, indent=2))
         return
     for (kind, survey), option in zip(surveys.items(), ("--device", "--ops"), strict=True):
-        typer.echo(f"{kind} ({option})")
+        say(f"{kind} ({option})")
         rows: list[tuple[str, object]] = [
             (f"  {device.name}", f"{device.description}: {device.problem or 'passes its test'}")
             for device in survey.devices
@@ -63,7 +63,7 @@ def info(
     found = read_bundle(bundle or default_bundle())
     manifest = found.manifest
     if as_json:
-        typer.echo(json.dumps({"folder": str(found.folder), **unparse(manifest)}, indent=2))
+        say(json.dumps({"folder": str(found.folder), **unparse(manifest)}, indent=2))
         return
     megabytes = sum((found.folder / file).stat().st_size for file in manifest.files) / 1e6
     rows = {

@@ -15,7 +15,9 @@ import typer
 
 from dior_rt import __version__
 from dior_rt.cli import options
+from dior_rt.cli.text import say
 from dior_rt.errors import InputError
+from dior_rt.files import is_same_file
 from dior_rt.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
@@ -80,9 +82,11 @@ def relight(
     watch = Watch()
     import numpy as np
 
+    from dior_rt.files import check_readable
     from dior_rt.images.photo import check_output, read_photo, write_photo
     from dior_rt.images.strokes import read_drawing
 
+    check_readable(photo, "photo")
     out = out or photo.with_name(f"{photo.stem}-relit.png")
     _refuse_same(out, photo, strokes)
     with _loading(bundle, device, ops) as load:
@@ -151,9 +155,11 @@ def estimate(
       dior-rt estimate photo.jpg -o lumi.png
     """
     watch = Watch()
+    from dior_rt.files import check_readable
     from dior_rt.images.photo import read_photo
     from dior_rt.images.strokes import check_lumi_output, write_lumi
 
+    check_readable(photo, "photo")
     out = out or photo.with_name(f"{photo.stem}-lumi.exr")
     _refuse_same(out, photo)
     with _loading(bundle, device, ops) as load:
@@ -199,7 +205,7 @@ def sparsify(
     strokes = NumpyOps().sparsify(read_lumi(lumi), mode, seed)
     write_strokes(out, strokes, {"version": __version__, "mode": mode, "seed": seed})
     if out.suffix.lower() == ".png" and (strokes.light[strokes.mask > 0] > 1).any():
-        _say("Light above display white was clipped; a .npy or .exr file keeps it.")
+        _warn("Light above display white was clipped; a .npy or .exr file keeps it.")
 
 
 class Watch(Stopwatch):
@@ -250,7 +256,7 @@ def _report(
 ) -> None:
     if not as_json:
         for notice in notices:
-            _say(notice)
+            _warn(notice)
         return
     report = {
         "result": str(out),
@@ -261,17 +267,17 @@ def _report(
         "ops": {"name": relighter.ops, "reason": relighter.ops_reason},
         "notices": list(notices),
     }
-    typer.echo(json.dumps(report, indent=2))
+    say(json.dumps(report, indent=2))
 
 
-def _say(notice: str) -> None:
+def _warn(notice: str) -> None:
     typer.echo(f"dior-rt: {notice}", err=True)
 
 
 def _refuse_same(out: Path, *inputs: Path) -> None:
     """Raise InputError where the result would replace one of the files it is made from."""
     for path in inputs:
-        if out.exists() and path.exists() and out.samefile(path):
+        if is_same_file(out, path):
             raise InputError(f"{out} is read from; name another file for the result.")
 
 

@@ -38,10 +38,12 @@ from dior_rt.images.photo import MOST_PIXELS, Photo, check_output, read_photo, w
 from dior_rt.images.primaries import Matrix, conversion, convert, srgb
 from dior_rt.kernels import NumpyOps, Stroke, Strokes
 from dior_rt.kernels.color import srgb_to_linear
+from dior_rt.kernels.types import FARTHEST
 from dior_rt.records import read_json
 
 Key = Literal["black"]
 
+SAME_SHAPE = 0.1  # of two shapes: the largest logarithm of the ratio of their aspect ratios
 _MOST_JSON_BYTES = 16 << 20
 
 
@@ -292,9 +294,15 @@ def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke]:
 def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
     """Pixels of the photo in one of the drawing's, across and down."""
     (columns, rows), (height, width) = _numbers(size, 2, "size"), photo_size
-    if not min(columns, rows) >= 1:
+    if not (min(columns, rows) > 0 and max(columns, rows) <= FARTHEST):
         raise ValueError("size must be [width, height] in pixels")
-    check_same_shape((round(rows), round(columns)), photo_size)
+    off = abs(math.log(columns / rows * height / width))
+    # One pixel of a very small drawing is so large a share that any shape would pass.
+    if off > SAME_SHAPE or not math.isfinite(off):
+        raise ValueError(
+            f"size is {columns:g} x {rows:g} and the photo is {width} x {height}: the shapes differ"
+        )
+    check_same_shape((max(1, round(rows)), max(1, round(columns))), photo_size)
     return width / columns, height / rows
 
 
