@@ -6,7 +6,6 @@ are data of the bundle, in presets.json: they were measured with its model, by `
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +24,7 @@ PRESETS: Final = "presets.json"
 MOST_BYTES: Final = 1 << 16
 
 ALWAYS: Final = (0.0, 1.0)
+MOST_GUIDANCE: Final = 1000.0  # far beyond any use; float32 still holds what the network makes of it
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Sampling(Preset):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (math.isfinite(self.guidance) and self.guidance >= 0):
-            raise ValueError(f"guidance must be a number of at least 0, not {self.guidance}")
+        if not 0 <= self.guidance <= MOST_GUIDANCE:
+            raise ValueError(f"guidance must lie between 0 and {MOST_GUIDANCE:g}, not {self.guidance:g}")
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise ValueError(f"tolerance must lie between 0 and 1, not {self.tolerance}")
 

@@ -23,9 +23,17 @@ from dior_rt.families.qwen.model import Qwen
 from dior_rt.flow.adaptive import sample_within
 from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.flow.schedule import ShiftSchedule
-from dior_rt.images.arrays import Picture, check_same_shape, like_photo, read_pixels, read_strokes
+from dior_rt.images.arrays import (
+    Picture,
+    check_same_shape,
+    in_primaries_of,
+    like_photo,
+    read_pixels,
+    read_strokes,
+)
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.kernels.types import STRONGEST
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
 from dior_rt.reach import check_reach, within_reach
 from dior_rt.stopwatch import Stopwatch
@@ -150,7 +158,8 @@ class Relighter:
     ) -> Relit:
         """The photo under the light of the strokes.
 
-        photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
+        photo: a Pillow image, which is read as its file would be (upright by its EXIF, in the colours of its
+        profile); or an array (H, W, 3), sRGB, of uint8, uint16, or float32 in 0..1.
         strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
         sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
         Stroke, in pixels of the photo.
@@ -179,9 +188,11 @@ class Relighter:
         watch = Stopwatch()
         pixels = read_pixels(photo)
         raster = self._family.raster(*pixels.shape[:2])
-        drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
+        drawn = self._reduce_strokes(in_primaries_of(photo, strokes), pixels.shape[:2], raster, intensity)
         if not drawn.mask.any():
-            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
+            return Relit(
+                like_photo(pixels.copy(), photo), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach
+            )
         source, encoded = self._reduce_photo(pixels, raster)
         watch.lap("kernels")
         condition = self._family.encode(encoded, drawn, "relight")
@@ -231,9 +242,10 @@ class Relighter:
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
         drawn = self._ops.reduce_strokes(light, mask, raster)
-        with np.errstate(over="ignore", invalid="ignore"):
-            drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
-        if not np.isfinite(drawn.light).all():
+        # In float64, which holds the product of any strokes and any intensity that is allowed.
+        light = drawn.light.astype(np.float64) * intensity
+        drawn = Strokes(light.clip(max=STRONGEST).astype(np.float32), drawn.mask)
+        if not light.max() <= STRONGEST:
             raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
         return drawn
 

@@ -3,12 +3,13 @@
 A file of JSON lines in the folder of the results, one line an event:
 
     {"state": "begun", "result": "a.png"}
-    {"state": "done", "result": "a.png", "photo": PRINT, "strokes": PRINT, "output": PRINT, "settings": H}
+    {"state": "done", "result": "a.png", "settings": HASH, "photo": PRINT, "strokes": ..., "output": ...}
     {"state": "failed", "result": "a.png", "reason": "..."}
 
-PRINT is [bytes, mtime in ns, sha256], H a hash. A result is written whole or not at all, and its name is "begun" before
+PRINT is [bytes, mtime in ns, sha256]. A result is written whole or not at all, and its name is "begun" before
 that; so a process that is killed at any moment leaves a state that the next one can go on from: what is begun
-and not done is done again, and replaces what the killed process may have written. What failed stays as it was.
+and not done is done again, and replaces what the killed process may have written. What failed stays as it
+was.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from dior_rt.batch.plan import Job
 from dior_rt.errors import DiorError, InputError
 from dior_rt.files import make_folder, reason
 from dior_rt.images.photo import check_output, read_photo, write_photo
-from dior_rt.images.strokes import Key, read_strokes
+from dior_rt.images.strokes import Key, read_drawing
 
 if TYPE_CHECKING:
     from dior_rt.relight import Relighter
@@ -53,14 +53,19 @@ def relight_file(
         picture = read_photo(job.photo)
         make_folder(job.result.parent)
         check_output(job.result, picture)
-        drawing = read_strokes(job.strokes, picture.size, key)
+        drawing = read_drawing(job.strokes, picture.size, key, primaries=picture.primaries)
         with turn or nullcontext():
             relit = relighter.relight(
-                picture.pixels, drawing, progress=lambda step, steps: not stopped(), **options
+                picture.pixels, drawing.strokes, progress=lambda step, steps: not stopped(), **options
             )
         settings = relighter.facts() | relit.facts()
-        write_photo(job.result, picture.with_pixels(np.asarray(relit.picture)), settings)
-        notices = (*picture.notices, *([relit.notice] if relit.notice else []))
+        lost = write_photo(job.result, picture.with_pixels(np.asarray(relit.picture)), settings)
+        notices = (
+            *picture.notices,
+            *(f"{job.strokes}: {notice}" for notice in drawing.notices),
+            *([relit.notice] if relit.notice else []),
+            *lost,
+        )
         return Outcome(
             job, None, notices, photo, strokes, Print.of(job.result), round(perf_counter() - start, 3)
         )

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from dior_rt.cli import options
+from dior_rt.cli.text import say
 from dior_rt.errors import InputError
 
 if TYPE_CHECKING:
@@ -129,9 +130,8 @@ def batch(
         return _show_plan(plan(read_journal(out)), as_json)
     make_folder(out)
     with Journal(out) as journal:
-        for name, record in journal.records.items():
-            if not record.is_done:
-                remove_drafts(out / name)
+        for folder in {(out / name).parent for name, record in journal.records.items() if not record.is_done}:
+            remove_drafts(folder)
         planned = plan(journal.records)
         progress = Progress(len(planned.jobs) + len(planned.refused), len(planned.done), quiet or as_json)
         for refused in planned.refused:
@@ -150,7 +150,7 @@ def batch(
                     progress.note(outcome)
     progress.finish()
     if as_json:
-        typer.echo(json.dumps(_report(out, progress, out / NAME), indent=2))
+        say(json.dumps(_report(out, progress, out / NAME), indent=2))
     if progress.failures:
         raise typer.Exit(SOME_FAILED)
 
@@ -171,16 +171,16 @@ def _show_plan(plan: Plan, as_json: bool) -> None:
             *({"photo": str(j.photo), "result": str(j.result), "done": True} for j in plan.done),
             *({"photo": str(r.photo), "error": r.reason} for r in plan.refused),
         ]
-        typer.echo(json.dumps(rows, indent=2))
+        say(json.dumps(rows, indent=2))
         return
     for job in plan.jobs:
-        typer.echo(f"{job.photo} + {job.strokes} -> {job.result}")
+        say(f"{job.photo} + {job.strokes} -> {job.result}")
     for job in plan.done:
-        typer.echo(f"{job.photo}: {job.result} is done")
+        say(f"{job.photo}: {job.result} is done")
     for refused in plan.refused:
-        typer.echo(f"{refused.photo}: {refused.reason}")
+        say(f"{refused.photo}: {refused.reason}")
     counts = f"{len(plan.jobs)} to relight, {len(plan.done)} done, {len(plan.refused)} that cannot be"
-    typer.echo(f"{counts}. Nothing was written.")
+    say(f"{counts}. Nothing was written.")
 
 
 def _report(out: Path, progress: Progress, journal: Path) -> dict[str, Any]:

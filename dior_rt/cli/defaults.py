@@ -38,7 +38,7 @@ COMMANDS: Final = ("relight", "batch", "estimate", "devices", "bench")
 
 @dataclass(frozen=True)
 class Default:
-    """One default. command: the one it is for, or None for all that have the option. source: where it stands."""
+    """One default. command: the one it is for; None: all that have the option. source: where it stands."""
 
     setting: str
     value: str | list[str]
@@ -59,7 +59,7 @@ def config_path(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def read_defaults(environment: Mapping[str, str] = os.environ) -> list[Default]:
-    """The defaults in force, later ones over earlier ones. Raises InputError for a file that makes no sense."""
+    """The defaults in force, later over earlier ones. Raises InputError for a file that makes no sense."""
     found = _read_file(config_path(environment), must=CONFIG in environment)
     for setting in SETTINGS:
         name = variable(setting)

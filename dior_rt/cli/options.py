@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,9 +13,12 @@ def _share(text: str) -> float:
     """A number, or a fraction such as 0.5/255."""
     above, bar, below = text.partition("/")
     try:
-        return float(Fraction(above) / Fraction(below if bar else 1))
-    except (ValueError, ZeroDivisionError, OverflowError):
-        raise typer.BadParameter(f"{text!r} is no number and no fraction such as 0.5/255.") from None
+        share = float(above) / (float(below) if bar else 1)
+    except (ValueError, ZeroDivisionError):
+        share = math.nan
+    if not math.isfinite(share):
+        raise typer.BadParameter(f"{text[:40]!r} is no number and no fraction such as 0.5/255.")
+    return share
 
 
 def _finite(value: float | None) -> float | None:
@@ -90,5 +92,9 @@ Format = Annotated[
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a result that is there already.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Page = Annotated[
+    int,
+    typer.Option(min=0, max=999, help="Which page of STROKES is read where it has several; 0 is the first."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object that says what was done.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

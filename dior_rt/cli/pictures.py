@@ -16,8 +16,9 @@ import typer
 from dior_rt import __version__
 from dior_rt.cli import options
 from dior_rt.cli.pipes import standard_files
+from dior_rt.cli.text import say
 from dior_rt.errors import InputError
-from dior_rt.files import check_free
+from dior_rt.files import check_free, is_same_file
 from dior_rt.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
@@ -57,8 +58,10 @@ def relight(
     intensity: options.Intensity = 1.0,
     reach: options.Reach = None,
     key: Annotated[
-        Literal["black"] | None, typer.Option(help="Read what is exactly black in STROKES as unspecified.")
+        Literal["black"] | None,
+        typer.Option(help="Read what is exactly black in STROKES as unspecified; not for JPEG."),
     ] = None,
+    page: options.Page = 0,
     format: options.Format = None,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
@@ -79,7 +82,7 @@ def relight(
     One more lamp, and the rest of the photo as it is:
       dior-rt relight photo.jpg strokes.png --reach 0.1
     A picture whose black means "not drawn":
-      dior-rt relight photo.jpg light.jpg --key black
+      dior-rt relight photo.jpg light.png --key black
     Fast, or within half a level of 255 of what all the steps would give:
       dior-rt relight photo.jpg strokes.png --preset fast
       dior-rt relight photo.jpg strokes.png --tolerance 0.5/255
@@ -89,23 +92,25 @@ def relight(
     watch = Watch()
     import numpy as np
 
+    from dior_rt.files import check_readable
     from dior_rt.images.photo import check_output, read_photo, write_photo
-    from dior_rt.images.strokes import read_strokes
+    from dior_rt.images.strokes import read_drawing
 
+    check_readable(photo, "photo")
     out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or 'png'}"), format)
     _refuse_same(out, photo, strokes)
     check_free(out, overwrite)
     with _loading(bundle, device, ops) as load:
         picture = read_photo(photo)
         check_output(out, picture)
-        drawing = read_strokes(strokes, picture.size, key)
+        drawing = read_drawing(strokes, picture.size, key, page, picture.primaries)
         watch.lap("read")
         relighter = load()
         watch.lap("load")
     with _progress("Relighting", quiet) as advance:
         relit = relighter.relight(
             picture.pixels,
-            drawing,
+            drawing.strokes,
             preset=preset,
             steps=steps,
             solver=solver,
@@ -120,18 +125,17 @@ def relight(
         )
     watch.lap("relight")
     settings = relighter.facts() | relit.facts()
-    write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
+    lost = write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
     watch.lap("write")
-    notices = [*picture.notices, *([relit.notice] if relit.notice else [])]
-    _report(
-        out,
-        picture.size,
-        settings,
-        watch.seconds | relit.seconds,
-        relighter,
-        [] if quiet else notices,
-        as_json,
-    )
+    notices = [
+        *(f"{photo}: {notice}" for notice in picture.notices),
+        *(f"{strokes}: {notice}" for notice in drawing.notices),
+        *([relit.notice] if relit.notice else []),
+        *lost,
+    ]
+    if quiet:
+        notices = []
+    _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, notices, as_json)
 
 
 def estimate(
@@ -158,9 +162,11 @@ def estimate(
       dior-rt estimate photo.jpg -o lumi.png
     """
     watch = Watch()
+    from dior_rt.files import check_readable
     from dior_rt.images.photo import read_photo
     from dior_rt.images.strokes import check_lumi_output, write_lumi
 
+    check_readable(photo, "photo")
     out = out or photo.with_name(f"{photo.stem}-lumi.exr")
     _refuse_same(out, photo)
     with _loading(bundle, device, ops) as load:
@@ -173,7 +179,7 @@ def estimate(
         lumi = relighter.estimate(picture.pixels, steps=steps, seed=seed, progress=watch.first_step(advance))
     watch.lap("estimate")
     settings = relighter.facts() | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
-    write_lumi(out, lumi, settings)
+    write_lumi(out, lumi, settings, picture.primaries)
     watch.lap("write")
     _report(out, lumi.shape[:2], settings, watch.seconds, relighter, picture.notices, as_json)
 
@@ -183,7 +189,7 @@ def sparsify(
         Path, typer.Argument(metavar="LUMI", help="A dense Lumi map: EXR or NPY, or a picture of one.")
     ],
     out: Annotated[
-        Path, typer.Option("--out", "-o", metavar="STROKES", help="RGBA PNG, or NPY to keep all.")
+        Path, typer.Option("--out", "-o", metavar="STROKES", help="RGBA PNG, or NPY or EXR to keep all.")
     ],
     mode: Annotated[
         Literal["strokes", "coarse", "dense"], typer.Option(help="How much of the map is kept, and how.")
@@ -206,7 +212,7 @@ def sparsify(
     strokes = NumpyOps().sparsify(read_lumi(lumi), mode, seed)
     write_strokes(out, strokes, {"version": __version__, "mode": mode, "seed": seed})
     if out.suffix.lower() == ".png" and (strokes.light[strokes.mask > 0] > 1).any():
-        _say("Light above display white was clipped; a .npy file keeps it.")
+        _warn("Light above display white was clipped; a .npy or .exr file keeps it.")
 
 
 class Watch(Stopwatch):
@@ -246,7 +252,7 @@ def _report(
 ) -> None:
     if not as_json:
         for notice in notices:
-            _say(notice)
+            _warn(notice)
         return
     report = {
         "result": str(out),
@@ -257,17 +263,17 @@ def _report(
         "ops": {"name": relighter.ops, "reason": relighter.ops_reason},
         "notices": list(notices),
     }
-    typer.echo(json.dumps(report, indent=2))
+    say(json.dumps(report, indent=2))
 
 
-def _say(notice: str) -> None:
+def _warn(notice: str) -> None:
     typer.echo(f"dior-rt: {notice}", err=True)
 
 
 def _refuse_same(out: Path, *inputs: Path) -> None:
     """Raise InputError where the result would replace one of the files it is made from."""
     for path in inputs:
-        if out.exists() and path.exists() and out.samefile(path):
+        if is_same_file(out, path):
             raise InputError(f"{out} is read from; name another file for the result.")
 
 

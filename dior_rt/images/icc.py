@@ -94,6 +94,19 @@ def interpret(samples: Pixels, icc: bytes) -> Coloured:
     return Coloured(curves.to_srgb(samples), curves, icc)
 
 
+def read_primaries(icc: bytes) -> NDArray[np.float64] | None:
+    """(3, 3) linear RGB -> XYZ under D50 of an RGB profile made of primaries and curves; else None."""
+    try:
+        tags = _tags(icc)
+        if icc[16:20] != b"RGB " or b"A2B0" in tags:
+            return None
+        columns = [struct.unpack_from(">3i", tags[name], 8) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
+    except (ValueError, KeyError, struct.error):
+        return None
+    matrix = np.array(columns, np.float64).T / 65536
+    return matrix if abs(np.linalg.det(matrix)) > 1e-6 else None
+
+
 def convert_to_srgb(image: Image.Image, icc: bytes) -> Image.Image:
     """An 8-bit picture and its ICC profile -> sRGB, relative colorimetric, black point compensated."""
     converted = ImageCms.profileToProfile(

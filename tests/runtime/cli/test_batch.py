@@ -146,7 +146,9 @@ def test_killed_in_the_middle_it_goes_on_and_ends_as_if_it_had_not_been(
         assert process.wait(60) == -signal.SIGKILL
     done = {name for name, record in read_journal(Path("out")).items() if record.is_done}
     assert 0 < len(done) < 12
-    (Path("out") / ".11.png.0123abcd").write_bytes(b"cut")  # as a process leaves that dies while it writes
+    (Path("out") / ".0123456789abcdef.part").write_bytes(
+        b"cut"
+    )  # as a process leaves that dies while it writes
     with (Path("out") / NAME).open("a") as journal:
         journal.write('{"state": "begun", "result": "11.png"}\n{"state": "do')
     times = {name: (Path("out") / name).stat().st_mtime_ns for name in done - {"11.png"}}
