@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from threading import BoundedSemaphore, Event
-from typing import Any, Final
+from typing import Final
 
 from dior_rt.batch.pipeline import run_jobs
 from dior_rt.batch.plan import Job
-from dior_rt.batch.work import Outcome, relight_file
+from dior_rt.batch.work import Outcome, Recipe, relight_file
 from dior_rt.bench.plan import usable_cores
 from dior_rt.bundle import Bundle
-from dior_rt.images.strokes import Key
 from dior_rt.relight import Relighter
 
 #: A model with fewer bytes relights one photo on each core; a larger one uses all cores for one photo.
@@ -29,9 +28,7 @@ class LocalEngine:
     at_once: int | None
     most_pixels: int
 
-    def run(
-        self, jobs: Iterable[Job], options: Mapping[str, Any], key: Key | None, begin: Callable[[str], None]
-    ) -> Iterator[Outcome]:
+    def run(self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]) -> Iterator[Outcome]:
         """Yield the outcomes as they come; `begin` is told each result's name before it may be written."""
         weights = sum((self.bundle.folder / file).stat().st_size for file in self.bundle.manifest.files)
         at_once = self.at_once or (usable_cores() if weights < SMALL_MODEL else 1)
@@ -44,7 +41,7 @@ class LocalEngine:
 
         def work(job: Job) -> Outcome:
             begin(job.name)
-            return relight_file(relighter, job, options, key, turns, stop.is_set)
+            return relight_file(relighter, job, recipe, turns, stop.is_set)
 
         # One more than are relit, so that files are read and written meanwhile.
         return run_jobs(jobs, work, at_once + 1, self.most_pixels, stop)

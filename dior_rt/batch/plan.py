@@ -15,6 +15,7 @@ from dior_rt.batch.journal import Record
 from dior_rt.batch.match import find_strokes
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable
+from dior_rt.images.readers import default_form
 
 
 @dataclass(frozen=True)
@@ -49,16 +50,17 @@ def make_plan(
     photos: Sequence[Found],
     strokes: Path | None,
     out: Path,
-    form: str,
+    form: str | None,
     records: Mapping[str, Record],
     settings: str,
     overwrite: bool,
 ) -> Plan:
     """Match the photos with their strokes and results, and compare them with the journal's records.
 
-    settings: the hash of all that decides the results beside the files. A result that this program wrote and
-    nobody changed since is replaced where its photo, strokes or settings have changed; any other file only
-    with overwrite. Raises InputError where two photos would have the same result.
+    form: the results' suffix; None: by each photo. settings: the hash of all that decides the results beside
+    the files. A result that this program wrote and nobody changed since is replaced where its photo, strokes
+    or settings have changed; any other file only with overwrite. Raises InputError where two photos would
+    have the same result.
     """
     jobs: list[Job] = []
     done: list[Job] = []
@@ -105,12 +107,13 @@ def _needs_work(job: Job, record: Record | None, settings: str, overwrite: bool)
     return True
 
 
-def _names(photos: Sequence[Found], form: str) -> list[str]:
+def _names(photos: Sequence[Found], form: str | None) -> list[str]:
     """The results' names: a.png, or a.jpg.png and a.cr2.png for photos that differ by their suffix alone."""
     plain = [photo.place.with_suffix("").as_posix() for photo in photos]
     count = Counter(name.casefold() for name in plain)
     names = [
-        f"{name if count[name.casefold()] == 1 else photo.place.as_posix()}.{form}"
+        (name if count[name.casefold()] == 1 else photo.place.as_posix())
+        + f".{form or default_form(photo.path)}"
         for name, photo in zip(plain, photos, strict=True)
     ]
     taken: dict[str, Found] = {}

@@ -58,6 +58,9 @@ def batch(
         Literal["black"] | None,
         typer.Option(help="Read what is exactly black in the strokes as unspecified."),
     ] = None,
+    quality: options.Quality = None,
+    bits: options.Bits = None,
+    sidecar: options.Sidecar = False,
     at_once: Annotated[
         int | None,
         typer.Option(min=1, max=1024, help="Photos that are relit at a time [default: by model and device]."),
@@ -68,6 +71,13 @@ def batch(
             min=0.1, metavar="MEGAPIXELS", help="All photos in memory together; a larger one goes alone."
         ),
     ] = 100.0,
+    engine: Annotated[
+        Literal["local", "ray"], typer.Option(help="Relight on this machine, or on a cluster of Ray.")
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of Ray's cluster [default: one of its own on this machine]."),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")
     ] = False,
@@ -92,14 +102,19 @@ def batch(
       dior-rt batch 'shots/*.jpg' -o relit --strokes window.json --format jpg --preset fast
     A list of names on standard input:
       find . -name '*.tif' -print0 | dior-rt batch - -o relit --strokes strokes/
+    On a cluster, whose machines all see the same folders:
+      dior-rt batch /photos -o /relit --engine ray --address ray://head:10001
     """
     from dior_rt.batch.find import find_photos, read_names
     from dior_rt.batch.journal import NAME, Journal, read_journal
     from dior_rt.batch.local import LocalEngine
     from dior_rt.batch.plan import hash_settings, make_plan
     from dior_rt.batch.progress import Progress
+    from dior_rt.batch.work import Recipe
     from dior_rt.bundle import default_bundle, read_bundle
+    from dior_rt.cli.extras import needs_extra
     from dior_rt.files import check_readable, make_folder, remove_drafts
+    from dior_rt.images.encoding import Encoding
 
     names = [name for text in photos for name in _listed(text, read_names)]
     if strokes is not None and not strokes.is_dir():
@@ -121,11 +136,22 @@ def batch(
         "intensity": intensity,
         "reach": reach,
     }
-    settings = hash_settings(model.sha256, {**sampling, "key": key})
+    settings = hash_settings(
+        model.sha256, {**sampling, "key": key, "quality": quality, "bits": bits, "sidecar": sidecar}
+    )
 
     def plan(records: Any) -> Plan:
-        return make_plan(found, strokes, out, format or "png", records, settings, overwrite)
+        return make_plan(found, strokes, out, format, records, settings, overwrite)
 
+    if engine == "ray":
+        with needs_extra("ray", "batch --engine ray"):
+            from dior_rt.batch.ray_engine import RayEngine
+
+        run_engine = RayEngine(model.folder, device, ops, address, at_once).run
+    elif address:
+        raise InputError("--address is of --engine ray.")
+    else:
+        run_engine = LocalEngine(model, device, ops, at_once, round(in_flight * 1e6)).run
     if dry_run:
         return _show_plan(plan(read_journal(out)), as_json)
     make_folder(out)
@@ -138,8 +164,8 @@ def batch(
             progress.fail(str(refused.photo), refused.reason)
             journal.failed(refused.name, refused.reason)
         if planned.jobs:
-            engine = LocalEngine(model, device, ops, at_once, round(in_flight * 1e6))
-            with closing(engine.run(planned.jobs, sampling, key, journal.begin)) as outcomes:
+            recipe = Recipe(sampling, key, Encoding(quality, int(bits) if bits else None), sidecar)
+            with closing(run_engine(planned.jobs, recipe, journal.begin)) as outcomes:
                 for outcome in outcomes:
                     if outcome.error is None:
                         assert outcome.photo and outcome.strokes and outcome.output

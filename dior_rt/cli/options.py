@@ -87,8 +87,22 @@ Reach = Annotated[
     ),
 ]
 Format = Annotated[
-    Literal["png", "jpg", "tif", "webp"] | None,
-    typer.Option(help="The kind of file to write [default: by the name of OUT, else png]."),
+    Literal["png", "jpg", "tif", "webp", "exr", "jxl"] | None,
+    typer.Option(
+        help="The kind of file to write [default: by the name of OUT, else png, tif for camera raw, or exr "
+        "for EXR]."
+    ),
+]
+Quality = Annotated[
+    int | None,
+    typer.Option(min=1, max=100, help="Of JPEG, WebP and JPEG XL [default: 95; JPEG XL keeps every pixel]."),
+]
+Bits = Annotated[
+    Literal["8", "16", "32"] | None,
+    typer.Option(help="Bits a channel; 16 also computes in 16 [default: as the photo has them]."),
+]
+Sidecar = Annotated[
+    bool, typer.Option("--sidecar", help="Write how the picture was made into an .xmp file beside it.")
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a result that is there already.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]

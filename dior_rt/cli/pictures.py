@@ -41,7 +41,7 @@ def relight(
             "--out",
             "-o",
             metavar="OUT",
-            help="PNG, JPEG, TIFF or WebP; - is standard output [default: PHOTO-relit.png].",
+            help="PNG, JPEG, TIFF, WebP, EXR or JPEG XL; - is standard output [default: PHOTO-relit.png].",
         ),
     ] = None,
     bundle: options.Bundle = None,
@@ -63,6 +63,9 @@ def relight(
     ] = None,
     page: options.Page = 0,
     format: options.Format = None,
+    quality: options.Quality = None,
+    bits: options.Bits = None,
+    sidecar: options.Sidecar = False,
     overwrite: options.Overwrite = False,
     quiet: options.Quiet = False,
     as_json: options.Json = False,
@@ -93,16 +96,22 @@ def relight(
     import numpy as np
 
     from dior_rt.files import check_readable
+    from dior_rt.images.encoding import Encoding
     from dior_rt.images.photo import check_output, read_photo, write_photo
+    from dior_rt.images.readers import default_form
+    from dior_rt.images.sidecar import sidecar_path, write_sidecar
     from dior_rt.images.strokes import read_drawing
 
     check_readable(photo, "photo")
-    out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or 'png'}"), format)
+    encoding = Encoding(quality, int(bits) if bits else None)
+    out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or default_form(photo)}"), format)
     _refuse_same(out, photo, strokes)
     check_free(out, overwrite)
+    if sidecar:
+        check_free(sidecar_path(out), overwrite)
     with _loading(bundle, device, ops) as load:
-        picture = read_photo(photo)
-        check_output(out, picture)
+        picture = read_photo(photo).with_bits(encoding.bits)
+        check_output(out, picture, encoding)
         drawing = read_drawing(strokes, picture.size, key, page, picture.primaries)
         watch.lap("read")
         relighter = load()
@@ -125,7 +134,9 @@ def relight(
         )
     watch.lap("relight")
     settings = relighter.facts() | relit.facts()
-    lost = write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
+    lost = write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings, encoding)
+    if sidecar:
+        write_sidecar(out, picture, settings)
     watch.lap("write")
     notices = [
         *(f"{photo}: {notice}" for notice in picture.notices),
