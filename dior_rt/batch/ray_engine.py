@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports to its makers otherwise
+os.environ.setdefault("RAY_raylet_start_wait_time_s", "120")  # a busy machine takes longer than Ray allows
 
 import ray
 import ray.data
@@ -64,8 +65,9 @@ class RayEngine:
         for job in jobs:
             begin(job.name)
         try:
-            ray.init(self.address, ignore_reinit_error=True, log_to_driver=False, logging_level="ERROR")
-        except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+            alone: dict[str, Any] = {} if self.address else {"include_dashboard": False}
+            ray.init(self.address, log_to_driver=False, logging_level="ERROR", **alone)
+        except Exception as error:  # Ray raises a bare Exception where its own processes do not start
             raise DeviceError(f"Cannot use Ray's cluster {self.address or ''}: {reason(error)}.") from error
         try:
             yield from self._outcomes(jobs, recipe)

@@ -53,7 +53,7 @@ from dior_rt.images.metadata import (
 from dior_rt.images.netpbm import is_deep_netpbm, read_netpbm
 from dior_rt.images.png_chunks import raw_profile
 from dior_rt.images.primaries import Matrix, conversion, srgb
-from dior_rt.images.readers import find_reader
+from dior_rt.images.readers import MissingReader, find_reader
 from dior_rt.images.sixteen_bit import STRATEGY, is_deep, read_deep, write_png, write_tiff
 from dior_rt.images.tiff_pages import read_facts as read_tiff_facts
 
@@ -159,6 +159,7 @@ def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
     """
     check_readable(path, what)
     cause: BaseException
+    reader = None
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's doubts about EXIF and size; both are dealt with here
@@ -174,8 +175,12 @@ def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
         cause, problem = error, f"it has more than {MOST_PIXELS // 10**6} megapixels"
     except MemoryError as error:
         cause, problem = error, "it does not fit into memory"
+    except MissingReader as error:
+        cause, problem = error, str(error)
     except DAMAGE as error:
         cause, problem = error, reason(error)
+        if reader:
+            problem = f"it is {reader.kind} that is damaged or of an unknown kind ({problem})"
     raise InputError(f"Cannot read the {what} {path}: {problem}.") from cause
 
 

@@ -18,6 +18,10 @@ RAW_SUFFIXES: Final = (
 )
 
 
+class MissingReader(Exception):  # noqa: N818 - it ends as part of an InputError
+    """A reader's extra is not installed; its text names it, as the end of a sentence."""
+
+
 @dataclass(frozen=True)
 class Reader:
     """module: of dior_rt.images. kind: for people. extra: what brings its library, or None for none.
@@ -29,13 +33,13 @@ class Reader:
     fits: Callable[[bytes, str], bool]
 
     def load(self) -> Callable[[Path], object]:
-        """The module's `read`. Raises ValueError, with the way out, where its extra is not installed."""
+        """The module's `read`. Raises MissingReader where its extra is not installed."""
         try:
             return import_module(f"dior_rt.images.{self.module}").read
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] == "dior_rt":
                 raise
-            raise ValueError(
+            raise MissingReader(
                 f"it is {self.kind}, which needs one more package: pip install 'dior-rt[{self.extra}]'"
             ) from error
 
