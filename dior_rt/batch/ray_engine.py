@@ -7,21 +7,24 @@ journal is the driver's: what is in it is not given out again when the driver is
 
 from __future__ import annotations
 
+import logging
 import os
 import pickle
+import socket
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports to its makers otherwise
-os.environ.setdefault("RAY_raylet_start_wait_time_s", "120")  # a busy machine takes longer than Ray allows
+os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
 
 import ray
 import ray.data
 
 from dior_rt.batch.plan import Job
 from dior_rt.batch.work import Outcome, Recipe, relight_file
+from dior_rt.bench.plan import usable_cores
 from dior_rt.errors import DeviceError
 from dior_rt.files import reason
 
@@ -65,8 +68,16 @@ class RayEngine:
         for job in jobs:
             begin(job.name)
         try:
+            _check_reachable(self.address)
+            logging.getLogger("ray").setLevel(logging.ERROR)
             alone: dict[str, Any] = {} if self.address else {"include_dashboard": False}
-            ray.init(self.address, log_to_driver=False, logging_level="ERROR", **alone)
+            # Ray gives an actor's BLAS one thread. Sums by other numbers of threads round differently, so
+            # actors get as many as the local engine has.
+            threads = os.environ.get("OMP_NUM_THREADS") or str(usable_cores())
+            environment = {"env_vars": {"OMP_NUM_THREADS": threads}}
+            ray.init(
+                self.address, log_to_driver=False, logging_level="ERROR", runtime_env=environment, **alone
+            )
         except Exception as error:  # Ray raises a bare Exception where its own processes do not start
             raise DeviceError(f"Cannot use Ray's cluster {self.address or ''}: {reason(error)}.") from error
         try:
@@ -90,3 +101,10 @@ class RayEngine:
         )
         for row in done.iter_rows():
             yield pickle.loads(row["outcome"])
+
+
+def _check_reachable(address: str | None) -> None:
+    """Raise OSError now where nobody listens at host:port: Ray itself would wait for minutes."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if colon and port.isdecimal():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
