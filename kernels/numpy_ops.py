@@ -59,13 +59,7 @@ class NumpyOps(Ops):
         return Strokes(value, (weight[..., 0] > 0).astype(np.float32))
 
     def _draw_strokes(self, strokes: list[Stroke], size: Grid) -> Strokes:
-        height, width = size
-        light, mask = np.zeros((height, width, 3), np.float32), np.zeros(size, np.float32)
-        for rows in bands(height, width, BAND):
-            for stroke in strokes:
-                _lay_over(light[rows], mask[rows], stroke, rows.start, size)
-        np.divide(light, mask[..., None], out=light, where=mask[..., None] > 0)
-        return Strokes(light, mask)
+        return draw.paint(strokes, size)
 
     def _coarsen(self, lumi: FloatArray, lattice: Lattice) -> Strokes:
         height, width = lumi.shape[:2]
@@ -118,33 +112,3 @@ def _weighted(light: Picture, mask: Picture) -> FloatArray:
     linear = light if light.dtype == np.float32 else decode_table(light.dtype)[light]
     weight = np.where(mask > 0, np.maximum(mask, np.float32(FAINTEST)), 0)[..., None]
     return np.concatenate([np.where(weight > 0, linear, np.float32(0)) * weight, weight], 2)
-
-
-def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int, size: Grid) -> None:
-    """Blend one stroke over a picture's band that starts at row `top`; light holds value * mask."""
-    ends, margin = draw.segments(stroke, size), draw.radius(stroke) + 1
-    if len(ends) == 0:
-        return
-    box = _window(ends.reshape(-1, 2), margin, top, mask.shape)
-    nearest = np.full(mask[box].shape, np.inf, np.float32)
-    if nearest.size == 0:
-        return
-    for segment in ends:
-        y, x = _window(segment.reshape(-1, 2), margin, top, mask.shape)
-        middle_y = np.arange(y.start, y.stop, dtype=np.float32)[:, None] + np.float32(top + 0.5)
-        middle_x = np.arange(x.start, x.stop, dtype=np.float32) + np.float32(0.5)
-        here = nearest[
-            y.start - box[0].start : y.stop - box[0].start, x.start - box[1].start : x.stop - box[1].start
-        ]
-        np.minimum(here, draw.distance_squared(segment, middle_x, middle_y), out=here)
-    cover = draw.coverage(stroke, np.sqrt(nearest))
-    light[box] += cover[..., None] * (np.array(stroke.light, np.float32) - light[box])
-    mask[box] += cover * (1 - mask[box])
-
-
-def _window(points: FloatArray, margin: float, top: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The rows and columns of a band that come within `margin` of the box of some points (x, y)."""
-    low = np.floor(points.min(0) - margin) - (0, top)
-    high = np.ceil(points.max(0) + margin) - (0, top)
-    (left, above), (right, below) = (np.clip(edge, 0, shape[::-1]).astype(int) for edge in (low, high))
-    return slice(above, below), slice(left, right)

@@ -22,6 +22,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, Literal
@@ -312,12 +313,20 @@ def _parse_stroke(item: Any, scale: tuple[float, float]) -> Stroke:
     _check_keys(item, known={"points", "width", *_OPTIONAL}, needed={"points", "width"})
     if not isinstance(item["points"], list):
         raise ValueError("points must be a list of [x, y]")
-    points = [_numbers(point, 2, "each point") for point in item["points"]]
+    points = _points(item["points"])
     return Stroke(
         points=tuple((x * scale[0], y * scale[1]) for x, y in points),
         width=_number(item["width"], "width") * math.sqrt(scale[0] * scale[1]),
         **{name: parse(item[name], name) for name, parse in _OPTIONAL.items() if name in item},
     )
+
+
+def _points(values: list[Any]) -> list[tuple[float, float]]:
+    flat = list(chain.from_iterable(values)) if set(map(type, values)) <= {list} else []
+    if flat and set(map(len, values)) == {2} and set(map(type, flat)) <= {int, float}:  # of many, fast
+        numbers = list(map(float, flat))
+        return list(zip(numbers[::2], numbers[1::2], strict=True))
+    return [(x, y) for x, y in (_numbers(point, 2, "each point") for point in values)]
 
 
 def _color(value: Any, what: str) -> tuple[float, ...]:
