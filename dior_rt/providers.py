@@ -17,6 +17,9 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 from dior_rt.errors import BundleError, DeviceError, InputError
 from dior_rt.files import reason
 
+with contextlib.suppress(Exception):  # the builds for Windows, which report to the system itself
+    ort.disable_telemetry_events()
+
 _ORT_ERRORS: tuple[type[Exception], ...] = (
     RuntimeError,
     ValueError,

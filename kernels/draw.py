@@ -58,9 +58,9 @@ def segments(stroke: Stroke, size: tuple[int, int]) -> FloatArray:
 
 
 def simplify(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """The points without those that a line of very many does not need: it stays within BLUR of where it was.
+    """The points without those that a line of very many does not need.
 
-    Each pass drops every second point that lies on the way between its neighbours, and may err by half as much
+    The line moves by less than BLUR. Each pass drops every second point that lies on the way between its neighbours, and may err by half as much
     as the one before.
     """
     allowed = BLUR / 2
@@ -221,7 +221,7 @@ def paint(strokes: Sequence[Stroke], size: tuple[int, int]) -> Strokes:
 def _nearest(
     ends: FloatArray, which: npt.NDArray[np.int64], tile: npt.NDArray[np.int64], columns: int
 ) -> tuple[npt.NDArray[np.int64], FloatArray]:
-    """The tiles that are touched, and each pixel's squared distance to the nearest segment, (tiles, side, side)."""
+    """The tiles that are touched, and the squared distances of their pixels, (tiles, side, side)."""
     tiles, place = np.unique(tile, return_inverse=True)
     nearest = np.full((len(tiles), SMALL_TILE, SMALL_TILE), np.inf, np.float32)
     inside = np.arange(SMALL_TILE, dtype=np.float32) + np.float32(0.5)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from dior_rt.kernels import draw
@@ -14,6 +18,7 @@ from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
 #: Pixels in a band: what is worked on at a time stays in the processor's cache.
 BAND = 1 << 16
+MOST_THREADS = 16
 
 
 class NumpyOps(Ops):
@@ -40,9 +45,18 @@ class NumpyOps(Ops):
         height, width = picture.shape[:2]
         down, across = area_weights(height, grid[0]), area_weights(width, grid[1])
         total = np.zeros((grid[0], width * 3), np.float32)
-        for rows in bands(height, width, BAND):
+        parts = list(bands(height, width, BAND))
+        sums: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+        def work(rows: slice) -> None:
             cells = down[:, rows].any(1)
-            total[cells] += down[cells, rows] @ self._decode(picture[rows]).reshape(-1, width * 3)
+            light = self._decode(picture[rows]).reshape(-1, width * 3)
+            sums[rows.start] = cells, down[cells, rows] @ light
+
+        each(work, parts)
+        for rows in parts:  # in their order, so that every run adds up to the same bits
+            cells, light = sums[rows.start]
+            total[cells] += light
         return across @ total.reshape(grid[0], width, 3)
 
     def _reduce_strokes(self, light: Picture, mask: Picture, grid: Grid) -> Strokes:
@@ -89,7 +103,8 @@ class NumpyOps(Ops):
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
         # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane a quantity.
         near_columns = [np.ascontiguousarray(np.moveaxis(nodes[:, column + m], 2, 0)) for m in range(3)]
-        for rows in bands(height, width, BAND):
+
+        def work(rows: slice) -> None:
             lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1) / np.float32(SIGMA)
             total = np.zeros((4, *lightness.shape), np.float32)
             for k, m in np.ndindex(3, 3):
@@ -102,7 +117,20 @@ class NumpyOps(Ops):
             linear = self._decode(photo[rows])
             relit = linear + (linear + np.float32(EPSILON)) * (q * (q + 2))
             result[rows] = self._encode(relit, photo.dtype)
+
+        each(work, list(bands(height, width, BAND)))
         return result
+
+
+def each(work: Callable[[slice], None], parts: list[slice]) -> None:
+    """Do the work on every part, on as many threads as there are cores: NumPy lets others run meanwhile."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if min(cores, len(parts)) < 2:
+        for part in parts:
+            work(part)
+        return
+    with ThreadPoolExecutor(min(cores, len(parts), MOST_THREADS)) as pool:
+        list(pool.map(work, parts))
 
 
 def _weighted(light: Picture, mask: Picture) -> FloatArray:
