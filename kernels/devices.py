@@ -71,8 +71,8 @@ def prepare_caches() -> None:
     PoCL would use ~/.cache/pocl/kcache, have no device at all where that cannot be written, and, without a
     HOME, load code from /tmp/pocl, which anyone may have put there. The folder is this program's own, so that
     it may be emptied where a file in it crashes the driver. The last resort is a temporary folder of this
-    process; pyopencl's is to cache nothing. To be called before pyopencl is imported. Raises KernelError where
-    nothing at all can be written."""
+    process; pyopencl's is to cache nothing. To be called before pyopencl is imported. Raises KernelError
+    where nothing at all can be written."""
     if "POCL_CACHE_DIR" in os.environ:
         return
     try:

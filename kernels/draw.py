@@ -60,8 +60,8 @@ def segments(stroke: Stroke, size: tuple[int, int]) -> FloatArray:
 def simplify(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """The points without those that a line of very many does not need.
 
-    The line moves by less than BLUR. Each pass drops every second point that lies on the way between its neighbours, and may err by half as much
-    as the one before.
+    The line moves by less than BLUR. Each pass drops every second point that lies on the way between its
+    neighbours, and may err by half as much as the one before.
     """
     allowed = BLUR / 2
     while len(points) > MANY:

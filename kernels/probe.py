@@ -96,8 +96,8 @@ def _check_room(device: Device, folder: Path) -> None:
         free = min(free, ROOM if limit == resource.RLIM_INFINITY else limit)
     if free < ROOM:
         raise KernelError(
-            f"opencl:{device.index} ({device.name}) needs {ROOM >> 20} MB in {folder} to compile its kernels, "
-            f"and there are {free >> 20}"
+            f"opencl:{device.index} ({device.name}) needs {ROOM >> 20} MB in {folder} to compile its kernels "
+            f"and has {free >> 20}"
         )
 
 

@@ -193,16 +193,17 @@ def _clean_exr(pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[
         alpha = pixels[..., 3]
         outside = int(((alpha < 0) | (alpha > 1)).sum())
         if outside:
-            notices.append(f"{outside} pixels have an alpha outside 0..1; it is brought to the nearer end.")
+            notices.append(f"Alpha outside 0..1 in {outside} pixels is brought to the nearer end.")
             np.clip(alpha, 0, 1, out=alpha)
-        np.divide(pixels[..., :3], pixels[..., 3:], out=pixels[..., :3], where=pixels[..., 3:] > 0)
+        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused
+            np.divide(pixels[..., :3], pixels[..., 3:], out=pixels[..., :3], where=pixels[..., 3:] > 0)
     light = pixels[..., :3]
     negative = (light < 0).any(axis=-1)
     if pixels.shape[2] == 4:
         negative &= pixels[..., 3] > 0
     if count := int(negative.sum()):
         least = float(light[negative].min())
-        notices.append(f"{count} pixels have negative light, down to {least:.2g}; it is read as none.")
+        notices.append(f"Negative light in {count} pixels, down to {least:.2g}, is read as none.")
         np.maximum(light, 0, out=light)
     return pixels, tuple(notices)
 
