@@ -56,8 +56,11 @@ class Engine:
         self.reason = reason or f"{device} was asked for"
         self._session = open_session(model, device, threads, keep)
         self._process = os.getpid()
-        self.inputs = tuple(map(_tensor, self._session.get_inputs()))
-        self.outputs = tuple(map(_tensor, self._session.get_outputs()))
+        try:
+            self.inputs = tuple(map(_tensor, self._session.get_inputs()))
+            self.outputs = tuple(map(_tensor, self._session.get_outputs()))
+        except UnicodeDecodeError as error:
+            raise BundleError(f"Cannot use {model}: a tensor's name in it is no text.") from error
         # Only the CPU's provider promises to run one session from several threads at once.
         self._lock = contextlib.nullcontext() if device == "cpu" else threading.Lock()
 

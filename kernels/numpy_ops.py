@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ class NumpyOps(Ops):
         down, across = area_weights(height, grid[0]), area_weights(width, grid[1])
         total = np.zeros((grid[0], width * 3), np.float32)
         parts = list(bands(height, width, BAND))
-        sums: dict[int, tuple[FloatArray, FloatArray]] = {}
+        sums: dict[int, tuple[Any, FloatArray]] = {}
 
         def work(rows: slice) -> None:
             cells = down[:, rows].any(1)

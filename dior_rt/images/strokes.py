@@ -166,8 +166,9 @@ def _read_raster(path: Path, what: str, photo_size: tuple[int, int] | None, page
         return _read_picture(path, what, photo_size, page)
     if page:
         raise InputError(f"Cannot read page {page} of the {what} {path}: it has one picture only.")
+    notices: tuple[str, ...] = ()
     if suffix == ".npy":
-        pixels, notices, space = _read_npy(path, what), (), srgb()
+        pixels, space = _read_npy(path, what), srgb()
     else:
         picture = read_exr_picture(path, what)
         (pixels, notices), space = _clean_exr(picture.pixels), picture.primaries
