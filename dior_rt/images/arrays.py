@@ -69,10 +69,11 @@ def convert_strokes(strokes: Sequence[Stroke], matrix: Matrix | None) -> list[St
     """Strokes whose light is converted by a matrix of `primaries.conversion`."""
     if matrix is None:
         return list(strokes)
-    return [
-        replace(stroke, color=tuple(float(c) for c in convert(np.array(stroke.color, np.float64), matrix)))
-        for stroke in strokes
-    ]
+    converted = []
+    for stroke in strokes:
+        red, green, blue = convert(np.array(stroke.color, np.float64), matrix).tolist()
+        converted.append(replace(stroke, color=(red, green, blue)))
+    return converted
 
 
 def convert_raster(raster: NDArray, matrix: Matrix | None) -> NDArray:

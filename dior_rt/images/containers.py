@@ -73,7 +73,8 @@ def _plain(file: IO[bytes], image: Image.Image, page: int) -> Facts:
 
 def _png(file: IO[bytes], image: Image.Image, page: int) -> Facts:
     chunks = read_chunks(file)
-    icc, notices = _bytes(image.info.get("icc_profile")), ()
+    icc = _bytes(image.info.get("icc_profile"))
+    notices: tuple[str, ...] = ()
     code = chunks.get(b"cICP", b"")
     if len(code) == 4:  # it stands over a profile, and that over sRGB, gAMA and cHRM
         icc = primaries.profile_of_codes(code[0], code[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ def read_netpbm(file: IO[bytes]) -> NDArray[np.uint16]:
         raise ValueError("its header is damaged")
     channels = 3 if kind in (3, 6) else 1
     count, body = width * height * channels, data[found.end() :]
+    samples: NDArray[Any]
     if kind in (2, 3):
         words = re.sub(rb"#[^\n]*", b"", body).split()[:count]
         samples = np.array([int(word) for word in words], np.int64)

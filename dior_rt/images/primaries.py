@@ -72,7 +72,7 @@ def conversion(source: Matrix, target: Matrix) -> Matrix | None:
     """(3, 3): linear light in the source's primaries -> in the target's; None where they are the same."""
     if np.abs(source - target).max() <= _SAME:
         return None
-    return np.linalg.solve(target, source)
+    return np.linalg.solve(target, source).astype(np.float64)
 
 
 def convert(light: NDArray[Any], matrix: Matrix | None) -> NDArray[Any]:

@@ -22,6 +22,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, Literal
@@ -165,8 +166,9 @@ def _read_raster(path: Path, what: str, photo_size: tuple[int, int] | None, page
         return _read_picture(path, what, photo_size, page)
     if page:
         raise InputError(f"Cannot read page {page} of the {what} {path}: it has one picture only.")
+    notices: tuple[str, ...] = ()
     if suffix == ".npy":
-        pixels, notices, space = _read_npy(path, what), (), srgb()
+        pixels, space = _read_npy(path, what), srgb()
     else:
         picture = read_exr_picture(path, what)
         (pixels, notices), space = _clean_exr(picture.pixels), picture.primaries
@@ -192,16 +194,17 @@ def _clean_exr(pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[
         alpha = pixels[..., 3]
         outside = int(((alpha < 0) | (alpha > 1)).sum())
         if outside:
-            notices.append(f"{outside} pixels have an alpha outside 0..1; it is brought to the nearer end.")
+            notices.append(f"Alpha outside 0..1 in {outside} pixels is brought to the nearer end.")
             np.clip(alpha, 0, 1, out=alpha)
-        np.divide(pixels[..., :3], pixels[..., 3:], out=pixels[..., :3], where=pixels[..., 3:] > 0)
+        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused
+            np.divide(pixels[..., :3], pixels[..., 3:], out=pixels[..., :3], where=pixels[..., 3:] > 0)
     light = pixels[..., :3]
     negative = (light < 0).any(axis=-1)
     if pixels.shape[2] == 4:
         negative &= pixels[..., 3] > 0
     if count := int(negative.sum()):
         least = float(light[negative].min())
-        notices.append(f"{count} pixels have negative light, down to {least:.2g}; it is read as none.")
+        notices.append(f"Negative light in {count} pixels, down to {least:.2g}, is read as none.")
         np.maximum(light, 0, out=light)
     return pixels, tuple(notices)
 
@@ -312,12 +315,20 @@ def _parse_stroke(item: Any, scale: tuple[float, float]) -> Stroke:
     _check_keys(item, known={"points", "width", *_OPTIONAL}, needed={"points", "width"})
     if not isinstance(item["points"], list):
         raise ValueError("points must be a list of [x, y]")
-    points = [_numbers(point, 2, "each point") for point in item["points"]]
+    points = _points(item["points"])
     return Stroke(
         points=tuple((x * scale[0], y * scale[1]) for x, y in points),
         width=_number(item["width"], "width") * math.sqrt(scale[0] * scale[1]),
         **{name: parse(item[name], name) for name, parse in _OPTIONAL.items() if name in item},
     )
+
+
+def _points(values: list[Any]) -> list[tuple[float, float]]:
+    flat = list(chain.from_iterable(values)) if set(map(type, values)) <= {list} else []
+    if flat and set(map(len, values)) == {2} and set(map(type, flat)) <= {int, float}:  # of many, fast
+        numbers = list(map(float, flat))
+        return list(zip(numbers[::2], numbers[1::2], strict=True))
+    return [(x, y) for x, y in (_numbers(point, 2, "each point") for point in values)]
 
 
 def _color(value: Any, what: str) -> tuple[float, ...]:

@@ -64,6 +64,7 @@ def merge(packet: bytes, settings: str, generated: bool) -> bytes:
         description.setAttribute("xmlns:Iptc4xmpExt", _IPTC)
         description.setAttributeNS(_IPTC, "Iptc4xmpExt:DigitalSourceType", SOURCE_TYPE)
     rdf.appendChild(description)
+    assert document.documentElement is not None  # it holds rdf:RDF
     return f"{_HEAD}{document.documentElement.toxml()}{_TAIL}".encode()
 
 
