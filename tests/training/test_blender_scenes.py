@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -19,14 +20,14 @@ from dior_rt.training.blender.meshes import Finish
 from dior_rt.training.blender.probe import Hits
 from dior_rt.training.blender.scene import Camera, Lamp, Thing
 from dior_rt.training.blender.store import View, ViewHead, load_view, save_view
-from dior_rt.training.blender.views import Job, numbers, reaches_enough
+from dior_rt.training.blender.views import Job, numbers, reaches_enough, render_views
 
 PLACES = ("floor", "small", "wall", "outdoor", "vehicle", "animal", "person")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A small asset folder: boxes in every place, random tiles, and panoramas by name only."""
+    """A small asset folder: boxes in every place, random tiles, and grey panoramas."""
     out = tmp_path_factory.mktemp("assets")
     (out / "models").mkdir()
     (out / "surfaces").mkdir()
@@ -43,7 +44,8 @@ def folder(tmp_path_factory):
     Image.fromarray(noise).save(out / "surfaces" / "sheet00.webp")
     (out / "surfaces" / "kinds.json").write_text(json.dumps(["Wood", "Fabric", "Bricks", "Grass"] * 8))
     for name in (*BENCH_PANORAMAS, "city", "forest", "hall"):
-        (out / "panoramas" / f"{name}.exr").touch()
+        light = np.full((16, 32, 3), 0.5, np.float32)
+        OpenEXR.File({}, {"RGB": light}).write(str(out / "panoramas" / f"{name}.exr"))
     return out
 
 
@@ -242,3 +244,26 @@ def test_people_stand_on_the_ground_and_are_dressed(folder):
         assert len(mesh.finishes) >= 6  # skin, clothes, shoes, eyes
         assert mesh.slots.max() < len(mesh.finishes)
         assert np.isfinite(mesh.vertices).all()
+
+
+def test_views_are_rendered_once_and_the_same_again(folder, tmp_path):
+    pytest.importorskip("bpy")
+    from dior_rt.training.blender.cycles import ShootOptions
+
+    options = ShootOptions(resolution=32, samples=4, lumi_samples=4)
+    first, again = (Job(tmp_path / name, folder, 3, 0) for name in ("first", "again"))
+    render_views(first, options)
+    render_views(again, options)
+    files = sorted(path.name for path in first.out.glob("*.npz"))
+    assert files and files == sorted(path.name for path in again.out.glob("*.npz"))
+    for name in files:
+        one, other = load_view(first.out / name), load_view(again.out / name)
+        assert np.array_equal(one.images, other.images)
+        assert len(one.images) >= 3
+        seen = one.sky < 0.5
+        assert one.lumi_maps()[:, seen].astype(np.float32).mean((1, 2)) == pytest.approx(0.25, rel=0.01)
+        assert not one.lumi_maps()[:, ~seen].any()
+        assert np.isfinite(one.images).all()
+    written = {path: path.stat().st_mtime_ns for path in first.out.iterdir()}
+    render_views(first, options)
+    assert written == {path: path.stat().st_mtime_ns for path in first.out.iterdir()}

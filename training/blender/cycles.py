@@ -134,11 +134,18 @@ class Studio:
         )
 
     def _light(self, lamps: Sequence[Lamp]) -> None:
-        for placed in self._lamps:
-            data = placed.data
-            bpy.data.objects.remove(placed)
-            bpy.data.lights.remove(data)
-        self._lamps = [_lamp(self._scene, lamp, f"L{k}") for k, lamp in enumerate(lamps)]
+        """Set the lamps. The objects stay from view to view: Cycles orders lights by when it first saw them,
+        and their order decides which light a random number picks."""
+        while len(self._lamps) < len(lamps):
+            placed = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "POINT"))
+            placed.visible_camera = False
+            placed.lightgroup = f"L{len(self._lamps)}"
+            self._scene.collection.objects.link(placed)
+            self._lamps.append(placed)
+        for k, placed in enumerate(self._lamps):
+            placed.hide_render = k >= len(lamps)
+            if k < len(lamps):
+                _set_lamp(placed, lamps[k])
 
     def _aim(self, camera: Camera) -> None:
         if self._scene.camera is None:
@@ -357,9 +364,10 @@ def _world(scene: Any, panorama: Panorama, file: Path) -> Any:
     return world
 
 
-def _lamp(scene: Any, lamp: Lamp, group: str) -> Any:
-    """Add a lamp of a strength that lights its target about as much as any other does."""
-    data = bpy.data.lights.new("lamp", lamp.kind.upper())
+def _set_lamp(placed: Any, lamp: Lamp) -> None:
+    """Set a light object up as a lamp, so strong that it lights its target as much as any other lamp does."""
+    placed.data.type = lamp.kind.upper()
+    data = placed.data
     far = math.dist(lamp.at, lamp.target)
     if lamp.kind == "sun":
         data.energy, data.angle = 1.0, math.radians(lamp.size)
@@ -369,15 +377,11 @@ def _lamp(scene: Any, lamp: Lamp, group: str) -> Any:
         data.energy, data.shadow_soft_size = 4 * math.pi**2 * far**2, lamp.size
     if lamp.kind == "spot":
         data.spot_size, data.spot_blend = math.radians(lamp.cone), lamp.blend
-    placed = bpy.data.objects.new("lamp", data)
     placed.location = lamp.at
     placed.rotation_euler = Vector(lamp.direction()).to_track_quat("-Z", "Y").to_euler()
-    placed.visible_camera = False
-    placed.lightgroup = group
+    data.use_nodes = lamp.gobo is not None
     if lamp.gobo:
         _cut(data, lamp, lamp.gobo)
-    scene.collection.objects.link(placed)
-    return placed
 
 
 def _cut(data: Any, lamp: Lamp, gobo: Gobo) -> None:
@@ -387,7 +391,7 @@ def _cut(data: Any, lamp: Lamp, gobo: Gobo) -> None:
     across /= np.linalg.norm(across)
     up = np.cross(across, ahead)
     c, s = math.cos(gobo.turn), math.sin(gobo.turn)
-    data.use_nodes = True
+    data.node_tree.nodes.clear()
     nodes = _Nodes(data.node_tree)
     way = nodes.add("ShaderNodeNewGeometry").outputs["Incoming"]
 
@@ -424,4 +428,5 @@ def _cut(data: Any, lamp: Lamp, gobo: Gobo) -> None:
         nodes.set(noise.inputs["Vector"], place)
         nodes.set(noise.inputs["Scale"], 1 / gobo.size)
         pattern = step(noise.outputs[0], 0.5, 0.3 * gobo.soft + 0.02)
-    nodes.set(data.node_tree.nodes["Emission"].inputs["Strength"], pattern)
+    shine = nodes.add("ShaderNodeEmission", (1, 1, 1, 1), pattern)
+    nodes.add("ShaderNodeOutputLight", shine)
