@@ -25,7 +25,6 @@ PRESETS: Final = "presets.json"
 MOST_BYTES: Final = 1 << 16
 
 ALWAYS: Final = (0.0, 1.0)
-MOST_GUIDANCE: Final = 1000.0  # far beyond any use; float32 still holds what the network makes of it
 
 
 @dataclass(frozen=True)

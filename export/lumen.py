@@ -122,8 +122,10 @@ def export_lumen(
 ) -> Bundle:
     """Write the bundle of a checkpoint at `out`.
 
-    weights: how they are stored; the graphs compute in float32. Raises InputError for files that cannot be used,
-    ExportError where the graphs compute something else than torch, and BundleError where nothing can be written.
+    weights: how they are stored; the graphs compute in float32. Raises InputError for files that cannot be
+    used, ExportError where the graphs compute something else than torch, and BundleError where nothing can
+    be
+    written.
     """
     check_target(out, overwrite)
     return export_network(load_lumen(checkpoint), out, config, weights, overwrite)
@@ -140,14 +142,19 @@ def export_network(
                 weight.data = weight.data.half().float()
     manifest = describe(config, weights)
     with tempfile.TemporaryDirectory() as scratch:
-        parts: dict[str, SceneGraph | LightGraph] = {"scene": SceneGraph(network), "light": LightGraph(network)}
+        parts: dict[str, SceneGraph | LightGraph] = {
+            "scene": SceneGraph(network),
+            "light": LightGraph(network),
+        }
         files: dict[str, Path] = {}
         for name, part in parts.items():
             files |= write_graph(part, name, Path(scratch), config.grid.multiple, weights)  # type: ignore[arg-type]
         engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
         worst = max(error_of(parts[name], engine, config.grid) for name, engine in engines.items())
         if not worst <= LARGEST_ERROR:
-            raise ExportError(f"The graphs are off by {worst:.2g} of their largest value; {LARGEST_ERROR:g} is allowed.")
+            raise ExportError(
+                f"The graphs are off by {worst:.2g} of their largest value; {LARGEST_ERROR:g} is allowed."
+            )
         graphs = {
             name: Graph(f"{name}.onnx", engine.inputs, engine.outputs, f"{name}.npz")
             for name, engine in engines.items()
@@ -167,7 +174,7 @@ def error_of(part: SceneGraph | LightGraph, engine: Engine, grid: GridRule) -> f
 
 
 def describe(config: LumenExportConfig, weights: Weights) -> Manifest:
-    """The manifest of an export, before its graphs are made. Raises InputError for a config that cannot be."""
+    """Return the manifest of an export without its graphs. Raises InputError for an invalid config."""
     try:
         return Manifest(
             family="lumen",

@@ -99,7 +99,9 @@ class Lumen:
         own = 2 * encode_light(condition["light"]) - 1
         if not condition["mask"].any() or guidance == 0:
             return lambda x, sigma: ((x - own) / np.float32(sigma)).astype(np.float32)
-        binding = self._light.bind({name: v for name, v in condition.items() if name not in ("albedo", "bounce")})
+        binding = self._light.bind(
+            {name: v for name, v in condition.items() if name not in ("albedo", "bounce")}
+        )
 
         def drawn(x: Array, sigma: float) -> Array:
             return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
@@ -147,7 +149,12 @@ def log_ratio(source: Array, target: Array, bounce: Array) -> Array:
 def bounced(light: Array, bounce: Array) -> Array:
     """Light (B, 3, h, w) with what has bounced."""
     near, far = bounce[:, :1], bounce[:, 1:]
-    return light + near * blur(light, NEARBY) + far * light.mean(axis=(2, 3), keepdims=True) + np.float32(BOUNCED)
+    return (
+        light
+        + near * blur(light, NEARBY)
+        + far * light.mean(axis=(2, 3), keepdims=True)
+        + np.float32(BOUNCED)
+    )
 
 
 def blur(cells: Array, deviation: float) -> Array:

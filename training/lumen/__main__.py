@@ -33,7 +33,9 @@ def pack_command(
     try:
         paths = sorted(renders.glob("train-*-*.npz"))
         if not paths:
-            raise InputError(f"There are no rendered views in {renders}; make some with `dior-rt train render`.")
+            raise InputError(
+                f"There are no rendered views in {renders}; make some with `dior-rt train render`."
+            )
         for path in write_shards(map(rendered, paths), out, int(largest * 1e6), shards, _count(len(paths))):
             print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     except DiorError as error:
@@ -53,12 +55,18 @@ def _count(total: int) -> Callable[[int], None]:
 def fit_command(
     packs: Annotated[Path, typer.Argument(help="Folder of shards that `pack` wrote.")],
     out: Annotated[Path, typer.Argument(help="Folder for the checkpoint; a run in it goes on.")],
-    minutes: Annotated[float | None, typer.Option(help="Train for this long; warm-up and decay follow.")] = None,
+    minutes: Annotated[
+        float | None, typer.Option(help="Train for this long; warm-up and decay follow.")
+    ] = None,
     steps: Annotated[int, typer.Option(help="Steps, where no minutes are given.")] = 1000,
     batch: Annotated[int, typer.Option(help="Samples a step.")] = 32,
     rate: Annotated[float, typer.Option(help="Largest learning rate.")] = 1e-3,
-    backbone: Annotated[Path | None, typer.Option(help="ImageNet weights to start the features from.")] = None,
-    surfaces: Annotated[Path | None, typer.Option(help="Folder of surface sheets, for new materials.")] = None,
+    backbone: Annotated[
+        Path | None, typer.Option(help="ImageNet weights to start the features from.")
+    ] = None,
+    surfaces: Annotated[
+        Path | None, typer.Option(help="Folder of surface sheets, for new materials.")
+    ] = None,
     precision: Annotated[str, typer.Option(help="auto, bf16 or fp32.")] = "auto",
     compiled: Annotated[bool, typer.Option(help="Compile the network: minutes once, then faster.")] = False,
     width: Annotated[int, typer.Option(help="Channels of a token.")] = 320,

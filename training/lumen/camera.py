@@ -1,4 +1,5 @@
-"""A batched camera: what carries linear renders towards real photos. The twin of the picture style in `camera.Camera`.
+"""A batched camera: what carries linear renders towards real photos. The twin of the picture style in
+`camera.Camera`.
 
     linear light -> blur -> noise -> picture style -> sharpening -> 8 bits
 

@@ -1,11 +1,13 @@
 """Complete the light: from strokes and a scene to the whole Lumi map that was meant.
 
-One network serves three blend modes. It answers with four maps: how much of the photo's own light is kept, how bright
-the new light is (by orientation, as in `scene`), which of the drawn colours it has, and how far a factor reaches:
+One network serves three blend modes. It answers with four maps: how much of the photo's own light is kept,
+how bright the new light is (by orientation, as in `scene`), which of the drawn colours it has, and how far
+a factor
+reaches:
 
     set        target = light * keep + new
-    add        target = light + new * peak(drawn)          so it is linear in the drawn value and never darkens
-    multiply   target = light * exp(reach * log drawn)
+    add        target = light + new * peak(drawn)          so it is linear in the drawn value and never
+    darkens multiply   target = light * exp(reach * log drawn)
 
 Where something is drawn the drawn value holds in the mean: see `hold`.
 """

@@ -25,6 +25,7 @@ from dior_rt.training.lumen.materials import load_tiles
 from dior_rt.training.lumen.model import Lumen
 from dior_rt.training.lumen.pack import load_shards
 
+SIZES: Final = LumenConfig()
 PART: Final = 15_000_000  # bytes of a file of a checkpoint
 WARM_UP: Final = 0.04
 DECAY: Final = 0.35
@@ -88,7 +89,7 @@ def fit(
     packs: Path,
     out: Path,
     config: FitConfig,
-    sizes: LumenConfig = LumenConfig(),
+    sizes: LumenConfig = SIZES,
     backbone: Path | None = None,
     surfaces: Path | None = None,
     progress: Progress | None = None,
@@ -126,8 +127,12 @@ def fit(
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         if config.compiled and clock.step - first == 15 and float(skipped) > 3:
-            print(f"{float(skipped):.0f} of 15 compiled steps had no finite gradient; going on without compiling.", flush=True)
-            step, skipped = make_step(network, replace(config, compiled=False), device), torch.zeros((), device=device)
+            print(
+                "The compiled network computes gradients that are not finite; going on without it.",
+                flush=True,
+            )
+            step = make_step(network, replace(config, compiled=False), device)
+            skipped = torch.zeros((), device=device)
         with torch.no_grad():
             share = max(1 / (clock.step + 2), min(0.05, clock_share(clock, first)))
             torch._foreach_lerp_(average, [weight.detach() for weight in network.parameters()], share)
@@ -139,7 +144,9 @@ def fit(
                     running[name] = value if name not in running else 0.8 * running[name] + 0.2 * value
             running["skipped"] = float(skipped)
             if float(skipped) > 20 + 0.6 * (clock.step - first):
-                raise InputError(f"Training diverged at step {clock.step}: most gradients are not finite. Lower --rate.")
+                raise InputError(
+                    f"Training diverged at step {clock.step}: most gradients are not finite. Lower --rate."
+                )
             if progress:
                 progress(clock.step, clock.done, running)
         now = time.monotonic()
@@ -164,7 +171,10 @@ def seconds_since_start() -> float:
 
 
 def clip(weights: list[nn.Parameter], largest: float) -> Tensor:
-    """Scale the gradients to a norm of at most `largest`; gradients that are not finite become 0. Returns 1 for these."""
+    """Scale the gradients to a norm of at most `largest`.
+
+    If any is not finite, all become 0, and 1 is returned.
+    """
     gradients = [weight.grad for weight in weights if weight.grad is not None]
     norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
     bad = ~norm.isfinite()
@@ -191,7 +201,10 @@ def make_optimizer(network: Lumen, config: FitConfig) -> torch.optim.Optimizer:
         share = BACKBONE_RATE if name.startswith("scene.backbone") else 1.0
         decay = config.weight_decay if weight.ndim > 1 else 0.0
         groups.setdefault((share, decay), []).append(weight)
-    rows = [{"params": weights, "share": share, "weight_decay": decay} for (share, decay), weights in groups.items()]
+    rows = [
+        {"params": weights, "share": share, "weight_decay": decay}
+        for (share, decay), weights in groups.items()
+    ]
     return torch.optim.AdamW(rows, lr=config.rate, betas=(0.9, 0.98), fused=True)
 
 
@@ -207,7 +220,10 @@ def states(batch: Batch, config: FitConfig, generator: torch.Generator) -> tuple
     return (1 - s) * batch.truth.x0 + s * noise, sigma
 
 
-def make_step(network: Lumen, config: FitConfig, device: torch.device) -> Callable[[Batch, Tensor, Tensor], dict[str, Tensor]]:
+Step = Callable[[Batch, Tensor, Tensor], dict[str, Tensor]]
+
+
+def make_step(network: Lumen, config: FitConfig, device: torch.device) -> Step:
     """A function that computes the gradients of one batch and returns its errors."""
     half = config.precision == "bf16" or (config.precision == "auto" and has_bf16(device))
 
@@ -238,13 +254,15 @@ def has_bf16(device: torch.device) -> bool:
     return "amx_bf16" in flags or "avx512_bf16" in flags
 
 
-# The state of a run: files of at most PART bytes, and an index that is written last. ------------------------------
+# The state of a run: files of at most PART bytes, and an index.
 
 INDEX: Final = "state.json"
 
 
-def store(out: Path, network: Lumen, average: list[Tensor], optimizer: torch.optim.Optimizer, clock: Clock) -> None:
-    """Write average, weights and moments. Weights and average are float16 pairs' sum: half and its rest in half."""
+def store(
+    out: Path, network: Lumen, average: list[Tensor], optimizer: torch.optim.Optimizer, clock: Clock
+) -> None:
+    """Write the average in float16, then the weights and their moments."""
     names = [name for name, _ in network.named_parameters()]
     tensors: dict[str, Tensor] = {}
     for name, mean in zip(names, average, strict=True):
@@ -257,7 +275,10 @@ def store(out: Path, network: Lumen, average: list[Tensor], optimizer: torch.opt
     for (name, weight), _ in zip(network.named_parameters(), names, strict=True):
         state[f"weight.{name}"] = weight.detach()
         moments = optimizer.state[weight]
-        state[f"first.{name}"], state[f"second.{name}"] = moments["exp_avg"].bfloat16(), moments["exp_avg_sq"].bfloat16()
+        state[f"first.{name}"], state[f"second.{name}"] = (
+            moments["exp_avg"].bfloat16(),
+            moments["exp_avg_sq"].bfloat16(),
+        )
     write_parts(out, "state", state)
 
 
@@ -288,8 +309,10 @@ def read_parts(out: Path, name: str) -> dict[str, Tensor]:
     return tensors
 
 
-def resume(out: Path, network: Lumen, average: list[Tensor], optimizer: torch.optim.Optimizer, clock: Clock) -> None:
-    """Take up what `store` wrote, on any device. Without the state's files it goes on from the average alone."""
+def resume(
+    out: Path, network: Lumen, average: list[Tensor], optimizer: torch.optim.Optimizer, clock: Clock
+) -> None:
+    """Take up what `store` wrote, on any device. Without the state's files, start from the average."""
     try:
         head = json.loads((out / INDEX).read_text())
         means, state = read_parts(out, "average"), read_parts(out, "state")
@@ -298,7 +321,9 @@ def resume(out: Path, network: Lumen, average: list[Tensor], optimizer: torch.op
                 mean.copy_(means[f"average.{name}"])
                 weight.copy_(state.get(f"weight.{name}", means[f"average.{name}"]))
                 if f"first.{name}" in state:
-                    first, second = (torch.empty_like(weight).copy_(state[f"{k}.{name}"]) for k in ("first", "second"))
+                    first, second = (
+                        torch.empty_like(weight).copy_(state[f"{k}.{name}"]) for k in ("first", "second")
+                    )
                     step = torch.tensor(float(head["step"]), device=weight.device)
                     optimizer.state[weight] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
         clock.step, clock.spent = int(head["step"]), float(head["spent"])

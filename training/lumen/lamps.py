@@ -1,8 +1,9 @@
 """A small lamp set close before the surface that a dab touches, computed from a view's positions and normals.
 
-A lone dab says little about the rest of the picture, so its light has to have a cause of its own: a lamp whose light
-falls off with the square of the distance and with the angle to each surface. A wall behind the object is farther from
-it than the object's own surface, so the light belongs to the object.
+A lone dab says little about the rest of the picture, so its light has to have a cause of its own: a lamp
+whose light falls off with the square of the distance and with the angle to each surface. A wall behind the
+object is
+farther from it than the object's own surface, so the light belongs to the object.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from torch import Tensor
 def positions(depth: Tensor, slope: Tensor, frame: Tensor) -> Tensor:
     """(B, 3, H, W) camera-space positions: x right, y up, z towards the camera (negative before it).
 
-    depth: (B, 1, H, W) along the view axis. slope: (B,) tangent of half the angle of view. frame: (B, 2, H, W) where
-    each cell lies in the full square picture, -1..1, x to the right and y up.
+    depth: (B, 1, H, W) along the view axis. slope: (B,) tangent of half the angle of view. frame: (B, 2, H,
+    W) where each cell lies in the full square picture, -1..1, x to the right and y up.
     """
     return torch.cat([frame * slope[:, None, None, None] * depth, -depth], dim=1)
 

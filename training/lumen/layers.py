@@ -1,4 +1,6 @@
-"""The building blocks: transformer blocks over tokens, residual convolutions over cells, and ways between the strides."""
+"""The building blocks: transformer blocks over tokens, residual convolutions over cells, and ways between
+the strides.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ Turns = tuple[Tensor, Tensor]  # cosine and sine of each token's position
 
 
 class Block(nn.Module):
-    """Attention and MLP under adaptive norms (DiT). modulation: 6 of (B, 1, width), or None for plain norms."""
+    """Attention and MLP under adaptive norms (DiT). modulation: (B, 6, width), or None for plain norms."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -38,7 +40,10 @@ class Block(nn.Module):
 
     def _attend(self, tokens: Tensor, turns: Turns) -> Tensor:
         q, k, v = self.qkv(tokens).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
-        q, k = rotate(F.normalize(q, dim=-1), turns), rotate(F.normalize(k, dim=-1), turns)  # (B, heads, N, size)
+        q, k = (
+            rotate(F.normalize(q, dim=-1), turns),
+            rotate(F.normalize(k, dim=-1), turns),
+        )  # (B, heads, N, size)
         mixed = F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v, scale=LARGEST_LOGIT)
         return self.proj(mixed.transpose(1, 2).flatten(2))
 
@@ -53,8 +58,12 @@ def rotations(rows: int, columns: int, size: int, device: torch.device) -> Turns
     Half of the pairs turn with the row, half with the column, so any shape of grid works.
     """
     frequency = torch.exp(-math.log(100.0) * torch.arange(size // 4, device=device) / (size // 4))
-    down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(rows, columns, size // 4)
-    along = (torch.arange(columns, device=device)[:, None] * frequency)[None, :, :].expand(rows, columns, size // 4)
+    down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(
+        rows, columns, size // 4
+    )
+    along = (torch.arange(columns, device=device)[:, None] * frequency)[None, :, :].expand(
+        rows, columns, size // 4
+    )
     angle = torch.cat([down, along], dim=2).reshape(rows * columns, size // 2)
     return torch.cos(angle), torch.sin(angle)
 
@@ -72,7 +81,10 @@ class Residual(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.norm = nn.GroupNorm(min(8, channels // 8), channels)
-        self.first, self.second = nn.Conv2d(channels, channels, 3, padding=1), nn.Conv2d(channels, channels, 3, padding=1)
+        self.first, self.second = (
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.Conv2d(channels, channels, 3, padding=1),
+        )
         nn.init.zeros_(self.second.weight)
         nn.init.zeros_(self.second.bias)  # type: ignore[arg-type]
 

@@ -40,7 +40,10 @@ def loss(
     """The sum of the weighted errors, and each error by name."""
     truth = batch.truth
     errors = scene_errors(scene, truth) | light_errors(completed, batch) | picture_errors(relit, truth)
-    total = sum((getattr(weights, name) * error for name, error in errors.items()), torch.zeros_like(relit[0, 0, 0, 0]))
+    total = sum(
+        (getattr(weights, name) * error for name, error in errors.items()),
+        torch.zeros_like(relit[0, 0, 0, 0]),
+    )
     return total, {name: error.detach() for name, error in errors.items()}
 
 
@@ -81,7 +84,10 @@ def light_errors(completed: Completed, batch: Batch) -> dict[str, Tensor]:
 def picture_errors(relit: Tensor, truth: Truth) -> dict[str, Tensor]:
     """Errors of the relit picture, sRGB-encoded. The photo's noise belongs to both."""
     error = shown(relit) - truth.relit
-    return {"picture": error.square().mean(), "edges": error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()}
+    return {
+        "picture": error.square().mean(),
+        "edges": error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean(),
+    }
 
 
 def gradients(error: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """New materials for rendered views: every object is tinted, and some get the texture of a real surface.
 
-A picture is about albedo times light, so a factor on an object's albedo is the same factor on its pictures. The Lumi
-map does not change: the network learns that light does not depend on the material.
+A picture is about albedo times light, so a factor on an object's albedo is the same factor on its pictures.
+The Lumi map does not change: the network learns that light does not depend on the material.
 """
 
 from __future__ import annotations
@@ -23,12 +23,16 @@ TEXTURED = 0.3  # share of the objects of the others that get a texture
 
 
 def load_tiles(folder: Path, most: int = 1024) -> Tensor:
-    """(N, 3, 128, 128) uint8: surface tiles from the sheets in a folder; 0 of them where there is no sheet."""
+    """Return surface tiles (N, 3, 128, 128) uint8 from the sheets in a folder; N is 0 without sheets."""
     tiles: list[np.ndarray] = []
     for path in sorted(folder.glob("sheet*.webp")):
         sheet = np.asarray(Image.open(path).convert("RGB"))
         rows, columns = sheet.shape[0] // TILE, sheet.shape[1] // TILE
-        cut = sheet[: rows * TILE, : columns * TILE].reshape(rows, TILE, columns, TILE, 3).transpose(0, 2, 4, 1, 3)
+        cut = (
+            sheet[: rows * TILE, : columns * TILE]
+            .reshape(rows, TILE, columns, TILE, 3)
+            .transpose(0, 2, 4, 1, 3)
+        )
         tiles += [tile for tile in cut.reshape(-1, 3, TILE, TILE) if tile.any()]
     if not tiles:
         return torch.zeros(0, 3, TILE, TILE, dtype=torch.uint8)
@@ -43,7 +47,9 @@ def factors(ids: Tensor, tiles: Tensor, generator: Generator) -> Tensor:
         return torch.rand(*shape, generator=generator, device=device)
 
     grey = 2 ** (1.6 * uniform(count, OBJECTS, 1) - 1.1)
-    tint = torch.exp(0.45 * torch.randn(count, OBJECTS, 3, generator=generator, device=device) * uniform(count, OBJECTS, 1))
+    tint = torch.exp(
+        0.45 * torch.randn(count, OBJECTS, 3, generator=generator, device=device) * uniform(count, OBJECTS, 1)
+    )
     table = grey * tint
     flat = ids.flatten(1).long()
     factor = table.gather(1, flat[..., None].expand(-1, -1, 3)).transpose(1, 2).unflatten(2, ids.shape[2:])

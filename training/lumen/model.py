@@ -20,7 +20,9 @@ from dior_rt.training.lumen.shading import log_ratio, relight
 
 
 class Lumen(nn.Module):
-    """photo -> scene (once a photo); scene and strokes -> completed light (every step of the flow) -> picture."""
+    """photo -> scene (once a photo); scene and strokes -> completed light (every step of the flow) ->
+    picture.
+    """
 
     def __init__(self, config: LumenConfig) -> None:
         super().__init__()
@@ -28,7 +30,9 @@ class Lumen(nn.Module):
         self.scene = SceneNetwork(config)
         self.light = LightNetwork(config)
 
-    def forward(self, x: Tensor, sigma: Tensor, photo: Tensor, strokes: Strokes) -> tuple[Scene, Completed, Tensor]:
+    def forward(
+        self, x: Tensor, sigma: Tensor, photo: Tensor, strokes: Strokes
+    ) -> tuple[Scene, Completed, Tensor]:
         """The scene, the completed light, and the relit picture, linear and not clipped."""
         scene = self.scene(photo)
         return scene, *self.answer(x, sigma, photo, scene, strokes)
@@ -38,7 +42,9 @@ class Lumen(nn.Module):
     ) -> tuple[Completed, Tensor]:
         """The completed light and the relit picture of a scene that is known."""
         completed = self.light(x, sigma, photo, scene, strokes)
-        ratio = log_ratio(scene.light, completed.target / torch.exp(completed.factor), scene.bounce, completed.factor)
+        ratio = log_ratio(
+            scene.light, completed.target / torch.exp(completed.factor), scene.bounce, completed.factor
+        )
         return completed, relight(photo, ratio)
 
 

@@ -1,6 +1,7 @@
 """Renders to shards that fit through a narrow door: one zip of pictures for many views, some 25 KB a view.
 
-A view is two AVIF sheets (colour: the picture under every source, the environment's Lumi map, normals and albedo;
+A view is two AVIF sheets (colour: the picture under every source, the environment's Lumi map, normals and
+albedo;
 grey: the lamps' Lumi maps and depth), a lossless PNG of object numbers, and a JSON head.
 """
 
@@ -116,8 +117,12 @@ def encode_view(view: Rendered) -> dict[str, bytes]:
         "side": int(view.images.shape[1]),
     }
     return {
-        f"{view.name}/colour.avif": _picture(sheet(colour), "AVIF", quality=COLOUR_QUALITY, subsampling="4:4:4", speed=6),
-        f"{view.name}/grey.avif": _picture(sheet(grey)[..., 0], "AVIF", quality=GREY_QUALITY, subsampling="4:0:0", speed=6),
+        f"{view.name}/colour.avif": _picture(
+            sheet(colour), "AVIF", quality=COLOUR_QUALITY, subsampling="4:4:4", speed=6
+        ),
+        f"{view.name}/grey.avif": _picture(
+            sheet(grey)[..., 0], "AVIF", quality=GREY_QUALITY, subsampling="4:0:0", speed=6
+        ),
         f"{view.name}/ids.png": _picture(ids, "PNG", optimize=True),
         f"{view.name}/head.json": json.dumps(head).encode(),
     }
@@ -141,8 +146,7 @@ def write_shards(
     paths: list[Path] = []
     archive: zipfile.ZipFile | None = None
     size = 0
-    done = 0
-    for files in _encoded(views):
+    for done, files in enumerate(_encoded(views), start=1):
         bytes_here = sum(len(data) + 2 * len(name) + 200 for name, data in files.items())
         if archive is None or size + bytes_here > largest:
             if archive is not None:
@@ -154,7 +158,6 @@ def write_shards(
         for name, data in files.items():
             archive.writestr(name, data)
         size += bytes_here
-        done += 1
         if progress:
             progress(done)
     if archive is not None:
@@ -177,7 +180,13 @@ def load_shards(folder: Path) -> Views:
         for path in paths:
             with zipfile.ZipFile(path) as archive:
                 names = sorted({name.split("/")[0] for name in archive.namelist()})
-                files = [{f: archive.read(f"{n}/{f}") for f in ("colour.avif", "grey.avif", "ids.png", "head.json")} for n in names]
+                files = [
+                    {
+                        f: archive.read(f"{n}/{f}")
+                        for f in ("colour.avif", "grey.avif", "ids.png", "head.json")
+                    }
+                    for n in names
+                ]
             loaded += list(pool.map(decode_view, files))
     return Views(**{name: torch.stack([view[name] for view in loaded]) for name in loaded[0]})
 

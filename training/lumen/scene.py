@@ -1,7 +1,7 @@
 """Read the scene from a photo: normals, depth, albedo, sky, and the light that lies on it.
 
-The light is a sum of a few colours, each as strong as one smooth map says, so that it cannot hold the picture's
-material; how bright it is depends on the surface's orientation:
+The light is a sum of a few colours, each as strong as one smooth map says, so that it cannot hold the
+picture's material; how bright it is depends on the surface's orientation:
 
     brightness(p) = decode(softplus(a(p) . (n(p), 1))),   light(p) = brightness(p) * sum_k share_k(p) colour_k
 
@@ -61,7 +61,9 @@ class SceneNetwork(nn.Module):
         self.geometry = nn.Conv2d(fine, NORMAL + DEPTH + SKY + ALBEDO, 3, padding=1)
         self.light_features = Residual(half)
         self.light = nn.Conv2d(half, ORIENTATION + config.colours + BOUNCES, 3, padding=1)
-        self.palette = nn.Sequential(nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, 3 * config.colours))
+        self.palette = nn.Sequential(
+            nn.Linear(2 * width, width), nn.SiLU(), nn.Linear(width, 3 * config.colours)
+        )
         for head in (self.light, self.palette[2]):
             nn.init.normal_(head.weight, std=1e-3)  # type: ignore[arg-type]
             nn.init.zeros_(head.bias)  # type: ignore[arg-type]
@@ -74,7 +76,9 @@ class SceneNetwork(nn.Module):
         rows, columns = photo.shape[2] // PATCH, photo.shape[3] // PATCH
         seen4, seen8, seen16 = self.backbone(double(photo))  # strides 2, 4 and 8 of the photo
         linear = srgb_to_linear(photo)
-        fine = F.silu(self.see(torch.cat([2 * photo - 1, torch.log(linear + 0.01) / 3], dim=1)))  # (B, fine, H, W)
+        fine = F.silu(
+            self.see(torch.cat([2 * photo - 1, torch.log(linear + 0.01) / 3], dim=1))
+        )  # (B, fine, H, W)
         half = self.to_half(fine, seen4)  # (B, half, H / 2, W / 2)
         quarter = self.to_quarter(half, seen8)  # (B, quarter, H / 4, W / 4)
         grid = self.to_tokens(quarter, seen16)  # (B, width, H / 8, W / 8)

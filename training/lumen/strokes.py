@@ -1,8 +1,9 @@
-"""How strokes are shown to the network. A drawing has one blend mode; a person's strokes of several are run as several.
+"""How strokes are shown to the network. A drawing has one blend mode; a person's strokes of several are run
+as several.
 
-    set        the light under the strokes is what was drawn
-    add        one more lamp: the light under the strokes is the photo's own plus what was drawn
-    multiply   a flag or a gel: the light under the strokes is the photo's own times what was drawn
+set        the light under the strokes is what was drawn
+add        one more lamp: the light under the strokes is the photo's own plus what was drawn
+multiply   a flag or a gel: the light under the strokes is the photo's own times what was drawn
 """
 
 from __future__ import annotations
@@ -31,15 +32,18 @@ def log_factor(drawn: Tensor) -> Tensor:
 
 
 def peak(drawn: Tensor, mask: Tensor) -> Tensor:
-    """(B, 1, 1, 1): the brightest luminance drawn, by which `add` strokes are divided so that they stay linear."""
+    """(B, 1, 1, 1): the brightest luminance drawn, by which `add` strokes are divided so that they stay
+    linear.
+    """
     return luminance(drawn * mask).amax(dim=(2, 3), keepdim=True).clamp_min(1e-4)
 
 
 def stroke_features(drawn: Tensor, mask: Tensor, blend: Tensor, light: Tensor) -> tuple[Tensor, Tensor]:
-    """What the network sees of strokes (B, 3, H, W) and mask (B, 1, H, W) in modes (B,), beside the photo's light.
+    """What the network sees of strokes (B, 3, H, W) and mask (B, 1, H, W) in modes (B,), beside the photo's
+    light.
 
-    Returns (B, 21, H, W): log-ratio, encoded light and mask, as drawn, spread nearby and spread far; and the colours
-    (B, 4, 3, H, W) of luminance 1 that completed light may be mixed from.
+    Returns (B, 21, H, W): log-ratio, encoded light and mask, as drawn, spread nearby and spread far; and
+    the colours (B, 4, 3, H, W) of luminance 1 that completed light may be mixed from.
     """
     mode = blend[:, None, None, None]
     is_set, is_add = (mode == SET).to(drawn), (mode == ADD).to(drawn)
@@ -59,7 +63,9 @@ def around(values: Tensor, mask: Tensor, deviation: float) -> Tensor:
 
 
 def drawn_colours(drawn: Tensor, mask: Tensor, light: Tensor) -> Tensor:
-    """(B, 4, 3, H, W): the drawn colour nearby, farther off and everywhere, and the photo's own, of luminance 1."""
+    """(B, 4, 3, H, W): the drawn colour nearby, farther off and everywhere, and the photo's own, of
+    luminance 1.
+    """
     white = drawn.new_full((1, 3, 1, 1), 1e-3)
     everywhere = (drawn * mask).mean(dim=(2, 3), keepdim=True).expand_as(drawn)
     near, far = (spread(drawn, mask, share * SIDE, 1e-6) for share in (NEAR, FAR))

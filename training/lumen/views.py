@@ -1,6 +1,7 @@
 """Rendered views as bytes on a device, and how light is put into bytes.
 
-Light x of a source whose brightest value is m becomes round(255 log(1 + 400 x / m) / log 401): steps of 1.2 to 2.4 %.
+Light x of a source whose brightest value is m becomes round(255 log(1 + 400 x / m) / log 401): steps of 1.2
+to 2.4 %.
 """
 
 from __future__ import annotations

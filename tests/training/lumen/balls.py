@@ -20,7 +20,7 @@ def ball(seed: int) -> Rendered:
     sky = (rows < 8) & ~inside
     normal[sky] = 0
     albedo = np.where(inside[..., None], rng.uniform(0.2, 0.9, 3), rng.uniform(0.2, 0.9, 3))
-    towards = rng.normal(size=(3, 3)) + [0, 0, 1.5]
+    towards = rng.normal(size=(3, 3)) + np.array([0, 0, 1.5])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     lamps = [np.repeat((normal @ d).clip(0)[..., None], 3, axis=2) for d in towards]
     world = (0.5 + 0.3 * normal[..., 1:2]) * np.array([0.8, 1.0, 1.2])

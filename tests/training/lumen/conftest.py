@@ -31,7 +31,9 @@ def views(shards: Path) -> Views:
 def network() -> Lumen:
     """A tiny network whose heads are loud enough that every path matters."""
     torch.manual_seed(0)
-    found = Lumen(LumenConfig(width=32, heads=1, scene_depth=1, light_depth=1, fine=16, half=16, quarter=16)).eval()
+    found = Lumen(
+        LumenConfig(width=32, heads=1, scene_depth=1, light_depth=1, fine=16, half=16, quarter=16)
+    ).eval()
     for head in (found.scene.light, found.light.head):
         torch.nn.init.normal_(head.weight, std=0.05)
     return found

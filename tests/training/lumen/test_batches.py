@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dior_rt.training.lumen import batches
-from dior_rt.training.lumen.batches import KEEP, LAMP, LOCAL, BatchMaker, mix
+from dior_rt.training.lumen.batches import KEEP, LOCAL, BatchMaker, mix
 from dior_rt.training.lumen.brush import distance
 from dior_rt.training.lumen.lamps import lamp_light
 from dior_rt.training.lumen.materials import factors
@@ -124,7 +124,9 @@ def test_distance_to_a_line() -> None:
 def test_new_materials_are_constant_on_an_object_and_spare_the_sky() -> None:
     ids = torch.zeros(16, 1, 8, 8, dtype=torch.uint8)
     ids[:, :, :, 4:], ids[:, :, :2] = 7, 255
-    factor = factors(ids.float(), torch.zeros(0, 3, 128, 128, dtype=torch.uint8), torch.Generator().manual_seed(1))
+    factor = factors(
+        ids.float(), torch.zeros(0, 3, 128, 128, dtype=torch.uint8), torch.Generator().manual_seed(1)
+    )
     assert torch.equal(factor[:, :, :2], torch.ones(16, 3, 2, 8))
     assert float(factor[:, :, 2:, 4:].std(dim=(2, 3)).max()) < 1e-6
     assert float(factor[:, :, 4, 5].std()) > 0.1

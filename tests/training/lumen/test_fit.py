@@ -16,7 +16,13 @@ TINY = LumenConfig(width=32, heads=1, scene_depth=1, light_depth=1, fine=16, hal
 def test_training_lowers_the_error(shards: Path, tmp_path: Path) -> None:
     totals: list[float] = []
     config = FitConfig(steps=30, batch=6, rate=3e-3)
-    fit(shards, tmp_path / "run", config, TINY, progress=lambda step, done, errors: totals.append(errors["total"]))
+    fit(
+        shards,
+        tmp_path / "run",
+        config,
+        TINY,
+        progress=lambda step, done, errors: totals.append(errors["total"]),
+    )
     assert totals[-1] < 0.85 * totals[0]
 
 
@@ -24,7 +30,9 @@ def test_a_run_goes_on_where_it_stopped(shards: Path, tmp_path: Path) -> None:
     steps: list[int] = []
     out = tmp_path / "run"
     fit(shards, out, FitConfig(steps=3, batch=2), TINY)
-    fit(shards, out, FitConfig(steps=5, batch=2), TINY, progress=lambda step, done, errors: steps.append(step))
+    fit(
+        shards, out, FitConfig(steps=5, batch=2), TINY, progress=lambda step, done, errors: steps.append(step)
+    )
     assert steps == [4, 5]
 
 

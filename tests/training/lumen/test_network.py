@@ -105,7 +105,9 @@ def test_double_is_bilinear() -> None:
 
 
 def test_blur_keeps_a_constant() -> None:
-    assert torch.allclose(blur(torch.full((1, 2, 12, 20), 0.7), 3.0), torch.full((1, 2, 12, 20), 0.7), atol=1e-6)
+    assert torch.allclose(
+        blur(torch.full((1, 2, 12, 20), 0.7), 3.0), torch.full((1, 2, 12, 20), 0.7), atol=1e-6
+    )
 
 
 def test_every_weight_learns(network: Lumen, views: Views) -> None:
@@ -114,7 +116,9 @@ def test_every_weight_learns(network: Lumen, views: Views) -> None:
     scene, completed, relit = network.train()(x, sigma, batch.photo, batch.strokes)
     total, _ = loss(scene, completed, relit, batch)
     total.backward()
-    silent = [name for name, weight in network.named_parameters() if weight.grad is None or not weight.grad.any()]
+    silent = [
+        name for name, weight in network.named_parameters() if weight.grad is None or not weight.grad.any()
+    ]
     network.zero_grad()
     # The convolutions inside residuals learn once the ones after them, which start at 0, have moved.
     assert not [name for name in silent if ".first." not in name and ".norm." not in name]
@@ -123,7 +127,9 @@ def test_every_weight_learns(network: Lumen, views: Views) -> None:
 def test_a_checkpoint_returns_the_same_network(network: Lumen, tmp_path: Path) -> None:
     save_lumen(network, tmp_path / "model.safetensors")
     loaded = load_lumen(tmp_path / "model.safetensors")
-    for (name, one), (_, other) in zip(network.state_dict().items(), loaded.state_dict().items(), strict=True):
+    for (name, one), (_, other) in zip(
+        network.state_dict().items(), loaded.state_dict().items(), strict=True
+    ):
         assert torch.equal(one, other), name
 
 
