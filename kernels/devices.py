@@ -12,7 +12,7 @@ from typing import Any
 
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
-from dior_rt.kernels.probe import probe
+from dior_rt.kernels.probe import DeviceCrash, probe
 from dior_rt.kernels.selftest import self_test
 from dior_rt.kernels.tested import TestedOps
 from dior_rt.kernels.types import KernelError
@@ -95,7 +95,7 @@ def open_ops(name: str = "auto") -> Ops:
     """The Ops of that name, see `open_device`; `reason` says why it was chosen.
 
     "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose
-    name contains the text; "auto": a GPU or accelerator, else NumPy. Under "auto" a device that
+    name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that
     cannot be opened gives way to the next, and one that fails later to NumPy; the reason says so. Raises
     KernelError where what was named cannot be had."""
     if name == "numpy":
@@ -138,7 +138,6 @@ def by_preference(devices: list[Device]) -> list[Device]:
 
 
 def _choose_best() -> Ops:
-    """A GPU, else NumPy: see docs/bench.md for why a CPU has no need of OpenCL."""
     ops: Ops = NumpyOps()
     try:
         devices = by_preference(list_devices())
@@ -146,11 +145,12 @@ def _choose_best() -> Ops:
     except KernelError as error:
         devices, problems = [], [str(error)]
     for device in devices:
-        if device.type == "cpu":
-            problems.append(f"opencl:{device.index} is this CPU, where NumPy starts sooner")
-            continue
         try:
             tested = open_device(device, spare=ops)
+        except DeviceCrash as error:
+            problems.append(str(error))
+            ops.notice = f"The pixel kernels run on NumPy: {error}."
+            continue
         except KernelError as error:
             problems.append(str(error))
             continue

@@ -25,11 +25,13 @@ class Ops(ABC):
     float32 and linear; 1.0 is display white. Arrays need not be contiguous; results are, and are always
     new.
 
-    name: what computes. reason: why it was chosen, one sentence.
+    name: what computes. reason: why it was chosen, one sentence. notice: what the user should know of the
+    choice, one sentence or "".
     """
 
     name: str
     reason: str = "it was asked for"
+    notice: str = ""
 
     def decode_srgb(self, picture: Picture) -> FloatArray:
         """sRGB -> linear, any shape. Floats outside 0..1 follow the curve's own extension; NaN stays NaN."""
