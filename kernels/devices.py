@@ -12,7 +12,7 @@ from typing import Any
 
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
-from dior_rt.kernels.probe import DeviceCrash, probe
+from dior_rt.kernels.probe import DeviceCrashError, probe
 from dior_rt.kernels.selftest import self_test
 from dior_rt.kernels.tested import TestedOps
 from dior_rt.kernels.types import KernelError
@@ -147,7 +147,7 @@ def _choose_best() -> Ops:
     for device in devices:
         try:
             tested = open_device(device, spare=ops)
-        except DeviceCrash as error:
+        except DeviceCrashError as error:
             problems.append(str(error))
             ops.notice = f"The pixel kernels run on NumPy: {error}."
             continue

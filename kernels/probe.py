@@ -28,7 +28,7 @@ _CODE = "import sys; from dior_rt.kernels.probe import try_device; try_device(in
 _INSIDE = "DIOR_RT_PROBE"
 
 
-class DeviceCrash(KernelError):
+class DeviceCrashError(KernelError):
     """A device whose driver ends the process that uses it."""
 
 
@@ -55,7 +55,7 @@ def probe(device: Device) -> None:
             with contextlib.suppress(OSError):
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    raise DeviceCrash(f"opencl:{device.index} ({device.name}) ends the process that uses it ({how})")
+    raise DeviceCrashError(f"opencl:{device.index} ({device.name}) ends the process that uses it ({how})")
 
 
 def try_device(index: int) -> None:
