@@ -135,10 +135,9 @@ def test_a_driver_that_crashes_means_numpy_a_notice_and_an_empty_cache(tmp_path)
     (tmp_path / "dior-rt" / "pocl").mkdir(parents=True)
     (tmp_path / "dior-rt" / "pocl" / "truncated").write_bytes(b"half")
     said = run(PROBE, XDG_CACHE_HOME=str(tmp_path), POCL_CACHE_DIR=None)
-    tries, _, rest = said.partition(" ")
-    assert (
-        int(tries) % 2 == 0 and rest.startswith("[1, 0") and " numpy | The pixel kernels run on NumPy" in rest
-    )
+    found = re.match(r"(\d+) \[(\d+), (\d+)", said)
+    assert found and int(found[1]) >= 2 and int(found[2]) >= 1 and found[3] == "0"
+    assert "] numpy | The pixel kernels run on NumPy" in said
     assert "signal 6" in said
 
 
