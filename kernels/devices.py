@@ -6,6 +6,7 @@ import atexit
 import os
 import shutil
 import tempfile
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ def list_devices() -> list[Device]:
             "processes by the method 'spawn'"
         )
     prepare_caches()
+    # An older pyopencl beside a newer pytools says so on every import; nobody here can act on it.
+    warnings.filterwarnings("ignore", message="pytools.persistent_dict")
     try:
         import pyopencl as cl
     except ModuleNotFoundError as error:
