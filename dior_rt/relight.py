@@ -126,6 +126,11 @@ class Relighter:
         return self._ops.reason
 
     @property
+    def ops_notice(self) -> str:
+        """What the user should know of that choice, such as a driver that crashes; "" for nothing."""
+        return self._ops.notice
+
+    @property
     def presets(self) -> tuple[str, ...]:
         """The names that `relight` takes as its preset. Raises BundleError."""
         return REFERENCE, *read_presets(self.bundle)

@@ -6,13 +6,14 @@ import atexit
 import os
 import shutil
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
 from dior_rt.kernels.guard import GuardedOps
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
-from dior_rt.kernels.probe import probe
+from dior_rt.kernels.probe import DeviceCrashError, probe
 from dior_rt.kernels.selftest import self_test
 from dior_rt.kernels.types import Device, KernelError
 
@@ -29,6 +30,8 @@ def list_devices() -> list[Device]:
             "processes by the method 'spawn'"
         )
     prepare_caches()
+    # An older pyopencl beside a newer pytools says so on every import; nobody here can act on it.
+    warnings.filterwarnings("ignore", message="pytools.persistent_dict")
     try:
         import pyopencl as cl
     except ModuleNotFoundError as error:
@@ -83,7 +86,7 @@ def open_ops(name: str = "auto") -> Ops:
     """Return the Ops of that name. Its `reason` says why it was chosen.
 
     "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose
-    name contains the text; "auto": a GPU or accelerator, else NumPy. Under "auto" a device that
+    name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that
     cannot be opened gives way to the next, and one that fails later to NumPy; the reason says so. Raises
     KernelError where what was named cannot be had."""
     if name == "numpy":
@@ -126,7 +129,6 @@ def by_preference(devices: list[Device]) -> list[Device]:
 
 
 def _choose_best() -> Ops:
-    """A GPU, else NumPy: see docs/bench.md for why a CPU has no need of OpenCL."""
     ops: Ops = NumpyOps()
     try:
         devices = by_preference(list_devices())
@@ -134,11 +136,12 @@ def _choose_best() -> Ops:
     except KernelError as error:
         devices, problems = [], [str(error)]
     for device in devices:
-        if device.type == "cpu":
-            problems.append(f"opencl:{device.index} is this CPU, where NumPy starts sooner")
-            continue
         try:
             tested = open_device(device, spare=ops)
+        except DeviceCrashError as error:
+            problems.append(str(error))
+            ops.notice = f"The pixel kernels run on NumPy: {error}."
+            continue
         except KernelError as error:
             problems.append(str(error))
             continue
