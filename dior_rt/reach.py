@@ -22,12 +22,17 @@ def check_reach(reach: float | None) -> None:
 
 
 def within_reach(source: Array, relit: Array, mask: Array, reach: float) -> Array:
-    """(relit + e) / (source + e) to the power of `closeness`, times source + e, less e: e as in `transfer`.
+    """Fade from `relit` where the mask (h, w) is above 0 to `source` beyond the reach."""
+    return fade(source, relit, closeness(mask > 0, reach))
 
-    source, relit: (h, w, 3) linear light; mask: (h, w), above 0 where anything is drawn.
+
+def fade(source: Array, relit: Array, nearness: Array) -> Array:
+    """(relit + e) / (source + e) to the power of `nearness`, times source + e, less e: e as in `transfer`.
+
+    source, relit: (h, w, 3) linear light; nearness: (h, w), 1 is all of `relit` and 0 all of `source`.
     """
     e = np.float32(EPSILON)
-    ratio = np.log((relit + e) / (source + e)) * closeness(mask > 0, reach)[..., None]
+    ratio = np.log((relit + e) / (source + e)) * nearness[..., None]
     return np.maximum((source + e) * np.exp(ratio) - e, 0)  # black comes back as a rounding error
 
 

@@ -7,11 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from threading import Lock
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from dior_rt.adaptive import sample_within
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
@@ -22,14 +25,19 @@ from dior_rt.family.qwen import Qwen
 from dior_rt.family.qwen_frame import shrink
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.lights import Composed, Cover, Light, compose, cover
 from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
-from dior_rt.reach import check_reach, within_reach
+from dior_rt.reach import check_reach, closeness, fade
 from dior_rt.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.schedule import ShiftSchedule
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
+#: What a person can draw: light and mask, strokes as lines, an RGBA picture, or layers.
+Drawing = Strokes | Sequence[Stroke] | Picture | Sequence[Light]
+
+MOST_COVERS = 64  # layers whose light grids an open photo keeps
 
 CANVAS = 2048  # pixels of the longest side on which strokes given as lines are drawn
 
@@ -114,11 +122,17 @@ class Relighter:
         """The names that `relight` takes as its preset. Raises BundleError."""
         return REFERENCE, *read_presets(self.bundle)
 
-    @_device_errors()
+    def open(self, photo: Picture) -> OpenPhoto:
+        """Prepare a photo to be relit many times: what depends on the photo alone is computed once.
+
+        photo: as `relight` takes it. Raises InputError.
+        """
+        return OpenPhoto(self, photo)
+
     def relight(
         self,
         photo: Picture,
-        strokes: Strokes | Sequence[Stroke] | Picture,
+        strokes: Drawing,
         *,
         preset: str | None = None,
         steps: int | None = None,
@@ -137,46 +151,32 @@ class Relighter:
         photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
         strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
         sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
-        Stroke, in pixels of the photo.
+        Stroke, in pixels of the photo; or a list of Light, which `dior_rt.lights` composes with the light on
+        the photo.
         preset: "reference" or a faster one of the model's own, such as "fast"; see `Relighter.presets`.
         steps, solver, shift, guidance, interval, tolerance: each goes over the preset's where it is not None;
-        see `Sampling`. intensity: multiplies the light, >= 0. reach: how far from the strokes light changes,
-        in longer sides of the photo, see `within_reach`; None: as far as the model takes it.
+        see `Sampling`. intensity: multiplies the drawn light, >= 0. reach: how far from the strokes light
+        changes, in longer sides of the photo, see `within_reach`; None: as far as the model takes it, or as
+        each Light says.
         progress: called after each step with (step, steps), of which it passes several at a time where the
         solver chooses its own; returning False stops with Cancelled.
 
         Raises InputError for what cannot be used, and DeviceError where a device fails.
         """
-        how = sampling(
-            self.bundle,
-            preset,
+        return self.open(photo).relight(
+            strokes,
+            preset=preset,
             steps=steps,
             solver=solver,
             shift=shift,
             guidance=guidance,
             interval=interval,
             tolerance=tolerance,
+            seed=seed,
+            intensity=intensity,
+            reach=reach,
+            progress=progress,
         )
-        _check_seed(seed)
-        _check_intensity(intensity)
-        check_reach(reach)
-        watch = Stopwatch()
-        pixels = read_pixels(photo)
-        raster = self._family.raster(*pixels.shape[:2])
-        drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
-        if not drawn.mask.any():
-            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
-        source, encoded = self._reduce_photo(pixels, raster)
-        watch.lap("kernels")
-        condition = self._family.encode(encoded, drawn, "relight")
-        x0, taken = self._sample(condition, how, seed, progress)
-        watch.lap("steps")
-        relit = _linear(self._family.decode_relit(x0, condition))
-        if reach is not None:
-            relit = within_reach(source, relit, drawn.mask, reach)
-        picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
-        watch.lap("transfer")
-        return Relit(picture, None, watch.seconds, taken, how, seed, intensity, reach)
 
     @_device_errors()
     def estimate(
@@ -190,6 +190,13 @@ class Relighter:
         _check_seed(seed)
         pixels = read_pixels(photo)
         _, encoded = self._reduce_photo(pixels, self._family.raster(*pixels.shape[:2]))
+        return self._estimate(encoded, how, seed, progress)
+
+    def _fast(self, **asked: Any) -> Sampling:
+        """The model's fast preset, or the reference where it has none."""
+        return sampling(self.bundle, "fast" if "fast" in self.presets else None, **asked)
+
+    def _estimate(self, encoded: Array, how: Sampling, seed: int, progress: Progress | None) -> Array:
         condition = self._family.encode(encoded, None, "estimate")
         x0, _ = self._sample(condition, how, seed, progress)
         return self._family.decode_lumi(x0, condition)
@@ -272,6 +279,188 @@ class Relighter:
         if how.interval == ALWAYS or how.guidance == 1:
             return guided
         return between(*how.interval, guided, self._family.velocity(condition, sigmas, 1.0))
+
+
+class OpenPhoto:
+    """One photo on a `Relighter`, to be relit many times. Safe to use from several threads.
+
+        photo = relighter.open(Image.open("photo.jpg"))
+        lamp = Light(drawn, blend="add", reach=0.2)
+        photo.preview([lamp]).picture      # small and fast
+        photo.relight([lamp]).picture      # the photo's size, every step
+
+    photo: as it was given. size: (rows, columns).
+    """
+
+    def __init__(self, relighter: Relighter, photo: Picture) -> None:
+        self.photo = photo
+        self._relighter = relighter
+        self._pixels = read_pixels(photo)
+        self.size: tuple[int, int] = self._pixels.shape[:2]
+        self._raster = relighter._family.raster(*self.size)
+        self._small: dict[int, NDArray] = {}
+        self._covers: list[tuple[Strokes | tuple[Stroke, ...], Cover]] = []
+        self._lock = Lock()
+
+    @_device_errors()
+    def relight(
+        self,
+        lights: Drawing,
+        *,
+        preset: str | None = None,
+        steps: int | None = None,
+        solver: str | None = None,
+        shift: float | None = None,
+        guidance: float | None = None,
+        interval: tuple[float, float] | None = None,
+        tolerance: float | None = None,
+        seed: int = 0,
+        intensity: float = 1.0,
+        reach: float | None = None,
+        progress: Progress | None = None,
+    ) -> Relit:
+        """The photo under the lights, at its full size: `Relighter.relight` says what each argument means."""
+        how = sampling(
+            self._relighter.bundle,
+            preset,
+            steps=steps,
+            solver=solver,
+            shift=shift,
+            guidance=guidance,
+            interval=interval,
+            tolerance=tolerance,
+        )
+        return self._relight(self._pixels, self.photo, lights, how, seed, intensity, reach, progress)
+
+    @_device_errors()
+    def preview(
+        self,
+        lights: Drawing,
+        *,
+        longest: int = 1024,
+        steps: int | None = None,
+        seed: int = 0,
+        intensity: float = 1.0,
+        reach: float | None = None,
+        progress: Progress | None = None,
+    ) -> Relit:
+        """The photo under the lights, fast: at most `longest` pixels a side, by the model's fast preset.
+
+        The light is that of `relight` with as many steps: the light grid is the full photo's. The picture is
+        uint8, (rows, columns, 3).
+        """
+        if longest < 1:
+            raise InputError(f"A preview must have at least 1 pixel a side, not {longest}.")
+        how = self._relighter._fast(steps=steps)
+        small = self.small(longest)
+        return self._relight(small, small, lights, how, seed, intensity, reach, progress)
+
+    def small(self, longest: int) -> NDArray[np.uint8]:
+        """The photo itself at the size of a preview: uint8, (rows, columns, 3)."""
+        scale = min(1.0, longest / max(self.size))
+        height, width = (max(1, round(side * scale)) for side in self.size)
+        with self._lock:
+            if longest not in self._small:
+                # For the eye alone, so Pillow's fast mean of the encoded values will do.
+                image = Image.fromarray(_to_8_bits(self._pixels))
+                reduced = image.resize((width, height), Image.Resampling.BOX, reducing_gap=2.0)
+                self._small[longest] = np.asarray(reduced)
+            return self._small[longest]
+
+    @_device_errors()
+    def source_map(self) -> Array:
+        """The light on the photo, by the model: a Lumi map (h, w, 3), linear >= 0, of the light grid."""
+        return self._source_map.copy()
+
+    @_device_errors()
+    def target_map(self, lights: Sequence[Light], *, intensity: float = 1.0) -> Strokes:
+        """What the lights ask for, composed with the source map, on the light grid."""
+        return self._compose(lights, intensity).target
+
+    @cached_property
+    def _reduced(self) -> tuple[Array, Array]:
+        return self._relighter._reduce_photo(self._pixels, self._raster)
+
+    @cached_property
+    def _source_map(self) -> Array:
+        how = self._relighter._fast(guidance=1.0)
+        return self._relighter._estimate(self._reduced[1], how, seed=0, progress=None)
+
+    def _relight(
+        self,
+        pixels: NDArray,
+        like: Picture,
+        lights: Drawing,
+        how: Sampling,
+        seed: int,
+        intensity: float,
+        reach: float | None,
+        progress: Progress | None,
+    ) -> Relit:
+        relighter = self._relighter
+        _check_seed(seed)
+        _check_intensity(intensity)
+        check_reach(reach)
+        watch = Stopwatch()
+        composed = self._target(lights, intensity, reach)
+        if not composed.target.mask.any():
+            unchanged = like.copy()
+            return Relit(unchanged, NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
+        source, encoded = self._reduced
+        watch.lap("kernels")
+        condition = relighter._family.encode(encoded, composed.target, "relight")
+        x0, taken = relighter._sample(condition, how, seed, progress)
+        watch.lap("steps")
+        relit = _linear(relighter._family.decode_relit(x0, condition))
+        if composed.nearness is not None:
+            relit = fade(source, relit, composed.nearness)
+        picture = like_photo(relighter._ops.transfer(pixels, source, relit), like)
+        watch.lap("transfer")
+        return Relit(picture, None, watch.seconds, taken, how, seed, intensity, reach)
+
+    def _target(self, lights: Drawing, intensity: float, reach: float | None) -> Composed:
+        if _are_layers(lights):
+            if reach is not None:
+                lights = [replace(light, reach=light.reach or reach) for light in lights]
+            return self._compose(lights, intensity)
+        drawn = self._relighter._reduce_strokes(lights, self.size, self._raster, intensity)
+        near = None if reach is None else closeness(drawn.mask > 0, reach)
+        return Composed(drawn, near)
+
+    def _compose(self, lights: Sequence[Light], intensity: float) -> Composed:
+        lights = [replace(one, strength=one.strength * intensity) for one in lights if one.on]
+        covers = [self._cover(light.drawn) for light in lights]
+        if not any(layer.coverage.any() for layer in covers):  # the source map is for those who need it
+            nothing = np.zeros((*self._raster, 3), np.float32)
+            return Composed(Strokes(nothing, nothing[..., 0]), None)
+        return compose(self._source_map, lights, covers)
+
+    def _cover(self, drawn: Strokes | tuple[Stroke, ...]) -> Cover:
+        """The layer on the light grid; kept, for most layers stay as they are while one is drawn."""
+        with self._lock:
+            for known, layer in self._covers:
+                if known is drawn:
+                    return layer
+        raster = drawn if isinstance(drawn, Strokes) else self._relighter._draw(drawn, self.size)
+        light, mask = read_strokes(raster)
+        if mask.shape != self._raster:
+            check_same_shape(mask.shape, self.size)
+        layer = cover(Strokes(light, mask), self._raster)
+        with self._lock:
+            self._covers = [(drawn, layer), *self._covers[: MOST_COVERS - 1]]
+        return layer
+
+
+def _to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)
+    return (np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _are_layers(lights: Drawing) -> TypeGuard[Sequence[Light]]:
+    return isinstance(lights, Sequence) and bool(lights) and all(isinstance(one, Light) for one in lights)
 
 
 def _linear(encoded: Array) -> Array:

@@ -7,8 +7,11 @@
     channel strokes.json   strokes as lines: [stroke, ...] or {"size": [width, height], "strokes": [stroke,
     ...]}
 
+    project.dior        the lights of a project of the light desk: see `dior_rt.project`
+
 A stroke in JSON is {"points": [[x, y], ...], "width": pixels} and, where wanted, "color": "#rrggbb" (sRGB) or
-[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1. Coordinates are pixels of "size", or else
+[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1, "blend": "set", "add" or "multiply" (see
+`dior_rt.lights`; strokes that only set speak for themselves, without the light on the photo). Coordinates are pixels of "size", or else
 of the photo as it is seen; (0, 0) is the upper left corner.
 """
 
@@ -17,17 +20,21 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dior_rt import project
 from dior_rt.errors import InputError
 from dior_rt.exr import read_exr, write_exr
 from dior_rt.files import check_readable, check_writable, reason, replacing
 from dior_rt.kernels import NumpyOps, Stroke, Strokes
 from dior_rt.kernels.color import srgb_to_linear
+from dior_rt.lights import BLENDS, Blend, Light
 from dior_rt.pictures import MOST_PIXELS, Photo, check_output, read_photo, write_photo
 from dior_rt.pixels import check_same_shape
 from dior_rt.records import read_json
@@ -37,14 +44,18 @@ Key = Literal["black"]
 _MOST_JSON_BYTES = 16 << 20
 
 
-def read_strokes(path: Path, photo_size: tuple[int, int], key: Key | None = None) -> NDArray | list[Stroke]:
+def read_strokes(
+    path: Path, photo_size: tuple[int, int], key: Key | None = None
+) -> NDArray | list[Stroke] | list[Light]:
     """Strokes from a file of any kind above, ready for `Relighter.relight`.
 
     photo_size: (height, width) of the photo. key: "black" reads pixels that are exactly black as unspecified.
     A raster comes as (H, W, 4): uint8 or uint16, sRGB-encoded, or float32, linear; the last channel is the
-    mask. JSON comes as strokes in the photo's pixels. Raises InputError for what cannot be read or makes no
-    sense.
+    mask. JSON comes as strokes in the photo's pixels, or as lights where any of them blends; a project as its
+    lights. Raises InputError for what cannot be read or makes no sense.
     """
+    if path.suffix.lower() == project.SUFFIX:
+        return project.lights_of(project.read_project(path), photo_size)
     if path.suffix.lower() == ".json":
         return _read_json(path, photo_size)
     raster = _read_raster(path, "strokes")
@@ -153,7 +164,7 @@ def _write_npy(path: Path, array: NDArray[np.float32]) -> None:
         np.save(file, array.astype(np.float32, copy=False), allow_pickle=False)
 
 
-def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke]:
+def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke] | list[Light]:
     check_readable(path, "strokes")
     try:
         document = read_json(path, _MOST_JSON_BYTES)
@@ -164,15 +175,29 @@ def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke]:
             document = document["strokes"]
         if not isinstance(document, list):
             raise ValueError("it must be a list of strokes")
-        strokes = []
+        strokes, blends = [], []
         for i, item in enumerate(document, 1):
             try:
                 strokes.append(_parse_stroke(item, scale))
+                blends.append(_blend(item))
             except (ValueError, OverflowError) as error:
                 raise ValueError(f"stroke {i}: {error}") from error
-        return strokes
+        return _layers(strokes, blends) if set(blends) - {"set"} else strokes
     except (OSError, ValueError, OverflowError) as error:
         raise InputError(f"Cannot read the strokes {path}: {reason(error)}.") from error
+
+
+def _blend(item: dict[str, Any]) -> Blend:
+    blend = item.get("blend", "set")
+    if blend not in BLENDS:
+        raise ValueError(f"blend must be one of {', '.join(BLENDS)}, not {blend!r:.40}")
+    return blend
+
+
+def _layers(strokes: list[Stroke], blends: list[Blend]) -> list[Light]:
+    """Strokes that follow one another with the same blend are one layer."""
+    runs = groupby(zip(blends, strokes, strict=True), key=itemgetter(0))
+    return [Light(tuple(stroke for _, stroke in run), blend) for blend, run in runs]
 
 
 def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
@@ -187,7 +212,7 @@ def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
 def _parse_stroke(item: Any, scale: tuple[float, float]) -> Stroke:
     if not isinstance(item, dict):
         raise ValueError("it must be an object with points and a width")
-    _check_keys(item, known={"points", "width", *_OPTIONAL}, needed={"points", "width"})
+    _check_keys(item, known={"points", "width", "blend", *_OPTIONAL}, needed={"points", "width"})
     if not isinstance(item["points"], list):
         raise ValueError("points must be a list of [x, y]")
     points = [_numbers(point, 2, "each point") for point in item["points"]]
