@@ -5,7 +5,8 @@
     gradient    full at one end of a line, nothing at the other, over the whole picture
     glow        an ellipse, full in the middle, nothing at its border
 
-Shapes of one layer lie over one another in order. A shape of coverage c and light D, over light L of mask m, gives
+The shapes of a layer lie over one another in order. A shape of coverage c and light D over light L of mask m
+gives
 
     m <- m (1 - c) + c        L m <- L m (1 - c) + D c
 
@@ -35,7 +36,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Paint:
-    """What every shape is filled with. color: linear RGB. intensity: multiplies it. flow: coverage of one pass,
+    """What a shape is filled with. color: linear RGB. intensity: multiplies it. flow: coverage of one pass,
     0..1. softness: 0 hard .. 1. erase: takes away instead."""
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)

@@ -7,8 +7,8 @@ the layer's strength and tint, and the coverage m in 0..1:
     add         T <- T + m D            one more lamp; it never darkens
     multiply    T <- T + m (D T - T)    a flag (D < 1) or a gel (a coloured D)
 
-All of it is linear light, and linear in D. The model gets T where a layer covers at least `LEAST_COVERAGE` of a
-cell, and completes the rest.
+All of it is linear light, and linear in D. The model gets T where a layer covers at least `LEAST_COVERAGE` of
+a cell, and completes the rest.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Cover:
-    """A layer on the light grid. amount: the mean of m D over each cell, (h, w, 3); coverage: of m, (h, w)."""
+    """A layer on the light grid. amount: each cell's mean of m D, (h, w, 3); coverage: of m, (h, w)."""
 
     amount: Array
     coverage: Array
@@ -71,8 +71,8 @@ class Cover:
 
 @dataclass(frozen=True)
 class Composed:
-    """What the lights ask for. target: the light, and where it is asked for. nearness: (h, w) in 0..1, how far
-    each cell may follow the model; None: all of them, all the way."""
+    """What the lights ask for. target: the light, and where. nearness: (h, w) in 0..1, how far each cell may
+    follow the model; None: all of them, all the way."""
 
     target: Strokes
     nearness: Array | None
@@ -89,7 +89,7 @@ def cover(drawn: Strokes, grid: tuple[int, int]) -> Cover:
 
 
 def compose(source: Array, lights: Sequence[Light], covers: Sequence[Cover]) -> Composed:
-    """Compose what the lights that are on ask for, the first at the bottom, over the source Lumi map (h, w, 3).
+    """Compose what the lights that are on ask for, the first at the bottom. source: the Lumi map (h, w, 3).
 
     covers: the lights on the grid of the source, one for each.
     """

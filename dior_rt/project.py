@@ -1,8 +1,8 @@
 """Projects of the light desk: the lights that were drawn on one photo, in one file.
 
 A `.dior` file is a zip that holds project.json: {"format": "dior project", "version": 1, "photo": {"name",
-"sha256", "size": [width, height]}, "settings": {...}, "lights": [...]}. Positions are pixels of the photo as it
-is seen. The photo itself is not in the file; its hash tells whether it is the one that was drawn on.
+"sha256", "size": [width, height]}, "settings": {...}, "lights": [...]}. Positions are pixels of the photo as
+it is seen. The photo itself is not in the file; its hash tells whether it is the one that was drawn on.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from dior_rt import __version__
 from dior_rt.adaptive import sample_within
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
@@ -76,6 +77,11 @@ class Relit:
         """The scale that was used."""
         return self.sampling.guidance
 
+    def facts(self) -> dict[str, Any]:
+        """What decided the result, for its metadata."""
+        used = {"steps": self.steps, "seed": self.seed, "intensity": self.intensity, "reach": self.reach}
+        return {**self.sampling.facts(), **used}
+
 
 class Relighter:
     """A model on a device: load once, relight many. Safe to use from several threads.
@@ -121,6 +127,16 @@ class Relighter:
     def presets(self) -> tuple[str, ...]:
         """The names that `relight` takes as its preset. Raises BundleError."""
         return REFERENCE, *read_presets(self.bundle)
+
+    def facts(self) -> dict[str, Any]:
+        """What makes its results, for their metadata. The manifest's hash covers those of all files."""
+        return {
+            "version": __version__,
+            "bundle": self.bundle.manifest.name,
+            "bundle_sha256": self.bundle.sha256,
+            "device": self.device,
+            "ops": self.ops,
+        }
 
     def open(self, photo: Picture) -> OpenPhoto:
         """Prepare a photo to be relit many times: what depends on the photo alone is computed once.

@@ -10,9 +10,9 @@
     project.dior        the lights of a project of the light desk: see `dior_rt.project`
 
 A stroke in JSON is {"points": [[x, y], ...], "width": pixels} and, where wanted, "color": "#rrggbb" (sRGB) or
-[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1, "blend": "set", "add" or "multiply" (see
-`dior_rt.lights`; strokes that only set speak for themselves, without the light on the photo). Coordinates are pixels of "size", or else
-of the photo as it is seen; (0, 0) is the upper left corner.
+[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1, "blend": "set", "add" or "multiply", see
+`dior_rt.lights`. Coordinates are pixels of "size", or else of the photo as it is seen; (0, 0) is the upper
+left corner.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ COMMANDS = {
     "relight": "pictures",
     "estimate": "pictures",
     "sparsify": "pictures",
+    "desk": "desk",
     "devices": "about",
     "info": "about",
     "bench": "bench",

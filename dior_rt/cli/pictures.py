@@ -28,7 +28,8 @@ def relight(
         Path,
         typer.Argument(
             metavar="STROKES",
-            help="The light: an RGBA PNG, an RGB picture, a float EXR or NPY map, or a JSON list of strokes.",
+            help="The light: an RGBA PNG, an RGB picture, a float EXR or NPY map, a JSON list of strokes, or "
+            "a project of the light desk (.dior).",
         ),
     ],
     out: Annotated[
@@ -69,6 +70,8 @@ def relight(
       dior-rt relight photo.jpg warm.json --intensity 3 -o warm.tif
     One more lamp, and the rest of the photo as it is:
       dior-rt relight photo.jpg strokes.png --reach 0.1
+    The lights of a project of the light desk, as `dior-rt desk` exports them:
+      dior-rt relight photo.jpg photo.dior
     A picture whose black means "not drawn":
       dior-rt relight photo.jpg light.jpg --key black
     Fast, or within half a level of 255 of what all the steps would give:
@@ -79,9 +82,14 @@ def relight(
     import numpy as np
 
     from dior_rt.pictures import check_output, read_photo, write_photo
+    from dior_rt.project import SUFFIX, hash_file, read_project
     from dior_rt.strokes import read_strokes
 
     out = out or photo.with_name(f"{photo.stem}-relit.png")
+    project = read_project(strokes) if strokes.suffix.lower() == SUFFIX else None
+    if project:  # its settings hold unless the command line says otherwise
+        preset, steps = preset or project.settings.preset, steps or project.settings.steps
+        seed, intensity = seed or project.settings.seed, intensity * project.settings.intensity
     _refuse_same(out, photo, strokes)
     with _loading(bundle, device, ops) as load:
         picture = read_photo(photo)
@@ -107,16 +115,12 @@ def relight(
             progress=watch.first_step(advance),
         )
     watch.lap("relight")
-    settings = _settings(relighter) | {
-        **relit.sampling.facts(),
-        "steps": relit.steps,
-        "seed": relit.seed,
-        "intensity": relit.intensity,
-        "reach": relit.reach,
-    }
+    settings = relighter.facts() | relit.facts()
     write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
     watch.lap("write")
     notices = [*picture.notices, *([relit.notice] if relit.notice else [])]
+    if project and project.photo.sha256 not in ("", hash_file(photo)):
+        notices.append(f"{strokes} was drawn on another file than {photo}, of the same size.")
     _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, notices, as_json)
 
 
@@ -158,7 +162,7 @@ def estimate(
     with _progress("Estimating") as advance:
         lumi = relighter.estimate(picture.pixels, steps=steps, seed=seed, progress=watch.first_step(advance))
     watch.lap("estimate")
-    settings = _settings(relighter) | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
+    settings = relighter.facts() | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
     write_lumi(out, lumi, settings)
     watch.lap("write")
     _report(out, lumi.shape[:2], settings, watch.seconds, relighter, picture.notices, as_json)
@@ -219,17 +223,6 @@ def _loading(bundle: Path | None, device: str, ops: str) -> Iterator[Callable[[]
 
     with ThreadPoolExecutor(1) as pool:
         yield pool.submit(load).result
-
-
-def _settings(relighter: Relighter) -> dict[str, Any]:
-    """What made the result, for its metadata. The manifest's hash covers those of all files."""
-    return {
-        "version": __version__,
-        "bundle": relighter.bundle.manifest.name,
-        "bundle_sha256": relighter.bundle.sha256,
-        "device": relighter.device,
-        "ops": relighter.ops,
-    }
 
 
 def _report(
