@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from dior_rt import _clone
+
 if TYPE_CHECKING:
     from dior_rt.relight import Relighter as Relighter
+
+_clone.install()
 
 __version__ = "0.1.0"
 __all__ = ["Relighter", "__version__"]

@@ -21,9 +21,9 @@ from typing import Final, Literal
 
 from dior_rt.errors import BundleError
 from dior_rt.files import reason
+from dior_rt.flow.schedule import DynamicShiftSchedule, ShiftSchedule
 from dior_rt.grid import GridRule
 from dior_rt.records import parse, read_json, unparse
-from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 FORMAT: Final = 2
 MANIFEST = "manifest.json"

@@ -22,8 +22,8 @@ from typing import Final, Literal
 import numpy as np
 from PIL import Image, ImageDraw
 
+from dior_rt.flow.sampler import Array
 from dior_rt.kernels import Strokes
-from dior_rt.sampler import Array
 
 #: Pixels of the longer side on which shapes are drawn: far finer than a light grid, and bounded.
 CANVAS: Final = 768

@@ -21,10 +21,10 @@ from typing import Final, Literal, get_args
 import numpy as np
 
 from dior_rt.errors import InputError
+from dior_rt.flow.sampler import Array
 from dior_rt.kernels import Stroke, Strokes
 from dior_rt.kernels.resample import area_weights
 from dior_rt.reach import check_reach, closeness
-from dior_rt.sampler import Array
 
 Blend = Literal["set", "add", "multiply"]
 BLENDS: Final[tuple[Blend, ...]] = get_args(Blend)

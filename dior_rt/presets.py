@@ -1,7 +1,7 @@
 """How the flow is walked, and the presets: ways to walk it faster whose name promises an error.
 
 `reference` is the model's own: all of its steps, by Euler's method, with guidance at every sigma. The others
-are data of the bundle, in presets.json: they were measured with its model, by `dior_rt.bench.presets`.
+are data of the bundle, in presets.json: they were measured with its model, by `tools.presets`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from typing import Any, Final
 from dior_rt.bundle import MOST_STEPS, Bundle
 from dior_rt.errors import BundleError, InputError
 from dior_rt.files import reason
+from dior_rt.flow.schedule import ShiftSchedule
+from dior_rt.flow.solvers import SOLVERS
 from dior_rt.records import parse, read_json
-from dior_rt.schedule import ShiftSchedule
-from dior_rt.solvers import SOLVERS
 
 REFERENCE: Final = "reference"
 #: The presets of a bundle, and what they promise: PSNR in dB to the reference's picture.

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dior_rt.errors import InputError
+from dior_rt.flow.sampler import Array
 from dior_rt.kernels.transfer import EPSILON
-from dior_rt.sampler import Array
 
 LEAST: Final = 1e-3  # of the picture's longer side: finer than any light grid
 

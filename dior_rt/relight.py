@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dior_rt import __version__
-from dior_rt.adaptive import sample_within
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
-from dior_rt.family import Family
-from dior_rt.family.mini import Mini
-from dior_rt.family.qwen import Qwen
-from dior_rt.family.qwen_frame import shrink
+from dior_rt.families import Family
+from dior_rt.families.mini import Mini
+from dior_rt.families.qwen.frame import shrink
+from dior_rt.families.qwen.model import Qwen
+from dior_rt.flow.adaptive import sample_within
+from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
+from dior_rt.flow.schedule import ShiftSchedule
+from dior_rt.images.arrays import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.lights import Composed, Cover, Light, compose, cover
-from dior_rt.pixels import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
 from dior_rt.reach import check_reach, closeness, fade
-from dior_rt.sampler import Array, State, Velocity, between, draw_noise, sample
-from dior_rt.schedule import ShiftSchedule
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]

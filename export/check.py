@@ -13,10 +13,10 @@ import torch
 
 from dior_rt.engine import Feeds
 from dior_rt.errors import DiorError
-from dior_rt.family import Mode, mini
+from dior_rt.families import Mode, mini
+from dior_rt.flow.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 from dior_rt.grid import GridRule
 from dior_rt.kernels import Strokes
-from dior_rt.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 
 SIGMAS: Final = (1.0, 0.9, 0.5, 0.1, 1e-3)
 SEEDS: Final = (0, 1, 2)

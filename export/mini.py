@@ -37,11 +37,11 @@ from dior_rt.export.check import (
 )
 from dior_rt.export.fused import OPSET, TRANSLATIONS, encode_fused, fused
 from dior_rt.export.lora import merge_lora
-from dior_rt.family import mini
+from dior_rt.families import mini
 from dior_rt.files import reason
+from dior_rt.flow.sampler import Array
+from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.grid import GridRule
-from dior_rt.sampler import Array
-from dior_rt.schedule import ShiftSchedule
 from dior_rt.training.network import LORA, WEIGHTS, Features, Mini, load_network
 
 Weights = Literal["fp16", "fp32", "int8"]

@@ -43,7 +43,7 @@ def render(
     ] = "plain",
 ) -> None:
     """Render random scenes, every light source alone, as pictures and as Lumi maps. Resumable."""
-    from dior_rt.training.render import render_scenes
+    from dior_rt.training.data.render import render_scenes
 
     share = _shard(shard)
     with typer.progressbar(length=len(range(share[0], scenes, share[1])), label="scenes") as bar:
@@ -146,7 +146,7 @@ def photos(
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:
     """Take photos of rendered scenes under several lights, by random cameras: pairs for `stage2`."""
-    from dior_rt.training.photos import take_photos
+    from dior_rt.training.data.photos import take_photos
 
     with typer.progressbar(length=scenes or len(list(renders.glob("*-1.npz"))), label="scenes") as bar:
         take_photos(renders, out, None, scenes, seed, lambda done, total: bar.update(1))
@@ -278,7 +278,7 @@ def maps(
     first: Annotated[int, typer.Option(min=0, help="The scene to begin with.")] = 0,
 ) -> None:
     """Render irradiance, shading and Phong maps of renders, in the Lumi map's place, for `ablation`."""
-    from dior_rt.training.maps import render_maps
+    from dior_rt.training.data.maps import render_maps
 
     with typer.progressbar(length=views, label="views") as bar:
         render_maps(renders, out, views, first, progress=lambda done, total: bar.update(1))
@@ -299,8 +299,8 @@ def ablation(
     """Train small networks on each kind of map, and on Lumi maps without stage 2, and compare them."""
     from dataclasses import replace
 
-    from dior_rt.training.ablation import Budget, ablate
     from dior_rt.training.evaluation.report import markdown, write_report
+    from dior_rt.training.studies.ablation import Budget, ablate
 
     budget = Budget()
     stage1 = replace(budget.stage1, steps=steps, batch=batch, precision=precision, seed=seed)
@@ -336,7 +336,7 @@ def recipes(
     from dataclasses import replace
 
     from dior_rt.training.evaluation.report import markdown, write_report
-    from dior_rt.training.recipes import PLAN, study, total_steps
+    from dior_rt.training.studies.recipes import PLAN, study, total_steps
 
     plan = replace(PLAN, steps=steps, batch=batch, precision=precision, seed=seed)
     with _Bar(total_steps(plan)) as bar:

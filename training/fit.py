@@ -23,6 +23,7 @@ from torch.utils.data import DataLoader, IterableDataset
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder
 from dior_rt.training.backbone import MiniLora
+from dior_rt.training.data.triplets import GRIDS, Batches, Grids, load_views
 from dior_rt.training.network import (
     BOUNCED,
     FLOOR,
@@ -35,7 +36,6 @@ from dior_rt.training.network import (
     srgb_to_linear,
 )
 from dior_rt.training.state import Average, State
-from dior_rt.training.triplets import GRIDS, Batches, Grids, load_views
 
 STOPS: Final = 2.0  # by which drawn light is strengthened or dimmed to see what it does
 STATE: Final = "state.safetensors"  # what a run resumes from

@@ -22,10 +22,10 @@ from torch.nn import functional as F
 from transformers import Qwen2_5_VLForConditionalGeneration, Qwen2Tokenizer
 
 from dior_rt.errors import InputError
-from dior_rt.family.mini import MODES
-from dior_rt.family.qwen_config import LUMI_PEAK, LUMI_SCALE
-from dior_rt.family.qwen_frame import fit_area
-from dior_rt.family.qwen_words import SKIP, TEMPLATE, Prompts
+from dior_rt.families.mini import MODES
+from dior_rt.families.qwen.frame import fit_area
+from dior_rt.families.qwen.settings import LUMI_PEAK, LUMI_SCALE
+from dior_rt.families.qwen.template import SKIP, TEMPLATE, Prompts
 from dior_rt.files import reason
 from dior_rt.training.backbone import resample
 from dior_rt.training.fit import Plan, Progress, rendered, run

@@ -25,12 +25,12 @@ from torch import Tensor
 from torch.utils.data import IterableDataset
 
 from dior_rt.errors import InputError
-from dior_rt.family.mini import MODES
+from dior_rt.families.mini import MODES
 from dior_rt.files import reason
+from dior_rt.flow.schedule import ShiftSchedule
+from dior_rt.images.photo import read_photo
 from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
-from dior_rt.pictures import read_photo
-from dior_rt.schedule import ShiftSchedule
 from dior_rt.training.backbone import Backbone
 from dior_rt.training.fit import Batch, Plan, Progress, rendered, run
 from dior_rt.training.network import RELIT_SCALE, linear_to_srgb

@@ -33,7 +33,7 @@ def made_up(count: int) -> list[Case]:
 def from_renders(folder: Path, count: int) -> list[Case]:
     """Pairs mixed from a folder of renders; half replace all lights, half change one, and of each half the
     light is given whole or as strokes. Needs dior-rt[train]. Raises InputError for too few renders."""
-    from dior_rt.training.triplets import interest, load_views, pair
+    from dior_rt.training.data.triplets import interest, load_views, pair
 
     views = load_views(folder)
     if len(views) < count:

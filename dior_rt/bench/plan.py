@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from dior_rt.bundle import Bundle
+from dior_rt.flow.solvers import SOLVERS
 from dior_rt.presets import REFERENCE, read_presets
-from dior_rt.solvers import SOLVERS
 
 STEPS = (1, 2, 4, 8, 16, 20)
 QUICK_STEPS = (1, 4, 16)

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from dior_rt.bench.cases import Case
 from dior_rt.bench.difference import compare_pictures
 from dior_rt.bundle import Bundle, write_bundle
+from dior_rt.flow.schedule import ShiftSchedule
+from dior_rt.flow.solvers import SOLVERS
 from dior_rt.presets import ALWAYS, PRESETS, PROMISES, Preset
 from dior_rt.relight import Relighter, Relit
-from dior_rt.schedule import ShiftSchedule
-from dior_rt.solvers import SOLVERS
 
 IDENTICAL: Final = 100.0  # dB that stand for a picture without any difference
 MARGIN: Final = 1.0  # dB that a preset keeps in hand for cases it has not seen

@@ -19,7 +19,7 @@ from dior_rt.bench.worker import Pair
 from dior_rt.bundle import Bundle
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, reason, replacing
-from dior_rt.pictures import Photo
+from dior_rt.images.photo import Photo
 from dior_rt.records import parse, read_json, unparse
 
 FORMAT: Final = 3

@@ -21,12 +21,16 @@ from dior_rt.bench.worker import STAGES, Job, Pair, Sample
 from dior_rt.bundle import Bundle, read_bundle
 from dior_rt.errors import DeviceError, DiorError
 from dior_rt.files import reason
-from dior_rt.pictures import read_photo
+from dior_rt.images.photo import read_photo
 from dior_rt.presets import REFERENCE
 from dior_rt.records import parse, unparse
 
 Advance = Callable[[str], None]  # called before every run, with what runs
 
+# The worker runs the same dior_rt as this process, whatever lies in the working folder.
+WORKER = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from dior_rt.bench.worker import main; main()"
+)
 #: Where compiled kernels are kept: by pyopencl, by PoCL, by NVIDIA's driver.
 CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
 
@@ -127,7 +131,7 @@ def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Samp
     """
     job = Job(setting, tuple(pairs), str(out), time.monotonic())
     process = subprocess.run(
-        [sys.executable, "-m", "dior_rt.bench.worker"],
+        [sys.executable, "-c", WORKER, json.dumps(sys.path)],
         input=json.dumps(unparse(job)),
         capture_output=True,
         text=True,

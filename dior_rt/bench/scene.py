@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from dior_rt.bench.worker import Pair
-from dior_rt.pictures import Photo, write_photo
+from dior_rt.images.photo import Photo, write_photo
 
 #: Coordinates are shares of the width and the height, widths are shares of the width.
 STROKES = (

@@ -69,8 +69,8 @@ def work(job: Job) -> Sample:
     def first_step(step: int, steps: int) -> None:
         started.append(time.monotonic() - job.spawned)
 
-    from dior_rt.pictures import read_photo, write_photo
-    from dior_rt.strokes import read_strokes
+    from dior_rt.images.photo import read_photo, write_photo
+    from dior_rt.images.strokes import read_strokes
 
     for index, pair in enumerate(job.pairs):
         watch = Stopwatch()
@@ -115,7 +115,3 @@ def main() -> None:
     except DiorError as error:
         answer = {"error": str(error)}
     print(json.dumps(answer))
-
-
-if __name__ == "__main__":
-    main()

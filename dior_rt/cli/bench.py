@@ -80,7 +80,7 @@ def bench(
     from dior_rt.bench.tables import compare as compare_reports
     from dior_rt.bundle import default_bundle, read_bundle
     from dior_rt.files import check_writable
-    from dior_rt.pictures import read_photo
+    from dior_rt.images.photo import read_photo
     from dior_rt.providers import available
 
     if plot:

@@ -15,7 +15,7 @@ from dior_rt.errors import InputError
 from dior_rt.files import reason
 
 if TYPE_CHECKING:
-    from dior_rt.schedule import ShiftSchedule
+    from dior_rt.flow.schedule import ShiftSchedule
 
 Precision = Literal["fp32", "fp16", "int8", "int4"]
 
@@ -132,7 +132,7 @@ def export(
 
 
 def _schedule(shift: float) -> ShiftSchedule:
-    from dior_rt.schedule import ShiftSchedule  # numpy is not for --help
+    from dior_rt.flow.schedule import ShiftSchedule  # numpy is not for --help
 
     try:
         return ShiftSchedule(shift)

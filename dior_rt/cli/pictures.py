@@ -81,9 +81,9 @@ def relight(
     watch = Watch()
     import numpy as np
 
-    from dior_rt.pictures import check_output, read_photo, write_photo
+    from dior_rt.images.photo import check_output, read_photo, write_photo
+    from dior_rt.images.strokes import read_strokes
     from dior_rt.project import SUFFIX, hash_file, read_project
-    from dior_rt.strokes import read_strokes
 
     out = out or photo.with_name(f"{photo.stem}-relit.png")
     project = read_project(strokes) if strokes.suffix.lower() == SUFFIX else None
@@ -148,8 +148,8 @@ def estimate(
       dior-rt estimate photo.jpg -o lumi.png
     """
     watch = Watch()
-    from dior_rt.pictures import read_photo
-    from dior_rt.strokes import check_lumi_output, write_lumi
+    from dior_rt.images.photo import read_photo
+    from dior_rt.images.strokes import check_lumi_output, write_lumi
 
     out = out or photo.with_name(f"{photo.stem}-lumi.exr")
     _refuse_same(out, photo)
@@ -188,8 +188,8 @@ def sparsify(
       dior-rt sparsify lumi.exr -o strokes.png --seed 7
       dior-rt relight photo.jpg strokes.png --intensity 2
     """
+    from dior_rt.images.strokes import check_strokes_output, read_lumi, write_strokes
     from dior_rt.kernels import NumpyOps
-    from dior_rt.strokes import check_strokes_output, read_lumi, write_strokes
 
     _refuse_same(out, lumi)
     check_strokes_output(out)

@@ -1,8 +1,8 @@
 """Who may speak to the server: the page that has the link, from this machine, and nobody else.
 
 Every address begins with a random token, which only the printed link has. A request is refused whose Host is
-not this server (DNS rebinding), or whose Origin is another page (cross-site requests). Answers may not be framed,
-kept by caches, or load anything from elsewhere.
+not this server (DNS rebinding), or whose Origin is another page (cross-site requests). Answers may not be
+framed, kept by caches, or load anything from elsewhere.
 """
 
 from __future__ import annotations

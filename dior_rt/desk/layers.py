@@ -1,7 +1,8 @@
 """Lights as layers for other programs: OpenRaster for Krita and GIMP, EXR, and a zip of PNGs.
 
-Each light becomes an RGBA layer of the photo's size: its colour is the drawn light times strength and tint, alpha
-is the coverage. EXR keeps any strength, premultiplied as EXR has it; PNG and OpenRaster clip at display white.
+Each light becomes an RGBA layer of the photo's size: its colour is the drawn light times strength and tint,
+alpha is the coverage. EXR keeps any strength, premultiplied as EXR has it; PNG and OpenRaster clip at display
+white.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dior_rt.errors import InputError
+from dior_rt.images.photo import Photo
 from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.lights import Light
-from dior_rt.pictures import Photo
 
 LAYER_FORMATS: Final = {
     "ora": "image/openraster",

@@ -19,9 +19,9 @@ from PIL import Image
 from dior_rt.desk.jobs import Job, Queue
 from dior_rt.drawing import Painter
 from dior_rt.errors import Cancelled, InputError
+from dior_rt.images.photo import Photo, read_photo, write_photo
 from dior_rt.kernels import Strokes
 from dior_rt.lights import Light
-from dior_rt.pictures import Photo, read_photo, write_photo
 from dior_rt.project import Project, lights_of
 from dior_rt.relight import OpenPhoto, Relighter
 

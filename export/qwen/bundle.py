@@ -25,13 +25,13 @@ from dior_rt.export.qwen.text import write_text_encoder
 from dior_rt.export.qwen.transformer import THETA, write_transformer
 from dior_rt.export.qwen.vae import write_decoder, write_encoder
 from dior_rt.export.qwen.weights import Checkpoint
-from dior_rt.family.qwen_config import FILE, LUMI_PEAK, MODULATION, PROMPTS, QwenSettings, TextSettings
-from dior_rt.family.qwen_layers import Layers
-from dior_rt.family.qwen_prompt import PromptEncoder
-from dior_rt.family.qwen_words import Prompts
+from dior_rt.families.qwen.layers import Layers
+from dior_rt.families.qwen.prompt import PromptEncoder
+from dior_rt.families.qwen.settings import FILE, LUMI_PEAK, MODULATION, PROMPTS, QwenSettings, TextSettings
+from dior_rt.families.qwen.template import Prompts
+from dior_rt.flow.sampler import Array
+from dior_rt.flow.schedule import DynamicShiftSchedule, ShiftSchedule
 from dior_rt.records import unparse
-from dior_rt.sampler import Array
-from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 AREA: Final = 1024**2
 VISION_AREA: Final = 384**2

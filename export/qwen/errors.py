@@ -17,10 +17,10 @@ from dior_rt.export.check import ExportError
 from dior_rt.export.qwen.graph import Precision
 from dior_rt.export.qwen.transformer import THETA, TransformerConfig
 from dior_rt.export.qwen.weights import Weights
-from dior_rt.family.qwen import Qwen
-from dior_rt.family.qwen_rope import joint_places, turns
+from dior_rt.families.qwen.model import Qwen
+from dior_rt.families.qwen.rope import joint_places, turns
+from dior_rt.flow.sampler import Array, draw_noise, sample
 from dior_rt.kernels import Strokes
-from dior_rt.sampler import Array, draw_noise, sample
 
 BLOCK_BAR: Final[dict[Precision, float]] = {
     "fp32": 1e-4,

@@ -21,7 +21,7 @@ from dior_rt.export.qwen.errors import BLOCK_BAR, load_weights
 from dior_rt.export.qwen.graph import Precision
 from dior_rt.export.qwen.text import TextConfig
 from dior_rt.export.qwen.weights import Checkpoint, Weights, read_config
-from dior_rt.sampler import Array
+from dior_rt.flow.sampler import Array
 
 VAE_BAR: Final = 1e-4  # largest error, relative to the largest value
 PICTURE: Final = (64, 96)

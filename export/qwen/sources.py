@@ -17,9 +17,9 @@ from dior_rt.export.qwen.text import TextConfig
 from dior_rt.export.qwen.transformer import TransformerConfig
 from dior_rt.export.qwen.vae import VaeConfig, vae_names
 from dior_rt.export.qwen.weights import Checkpoint, Merged, read_config
-from dior_rt.family.qwen_config import TextSettings, VisionSettings
-from dior_rt.family.qwen_words import PICTURE, SKIP, TEMPLATE
-from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
+from dior_rt.families.qwen.settings import TextSettings, VisionSettings
+from dior_rt.families.qwen.template import PICTURE, SKIP, TEMPLATE
+from dior_rt.flow.schedule import DynamicShiftSchedule, ShiftSchedule
 
 MULTIPLE: Final = 32
 

@@ -38,8 +38,8 @@ from dior_rt.export.mini import (
     round_to_half,
     store_as_half,
 )
-from dior_rt.family import mini
-from dior_rt.schedule import ShiftSchedule
+from dior_rt.families import mini
+from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.training.network import Mini, save_network
 
 

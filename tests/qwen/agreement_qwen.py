@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from dior_rt.export.qwen.bundle import Recipe
-from dior_rt.family.qwen import Condition
-from dior_rt.family.qwen_frame import Frame
-from dior_rt.family.qwen_words import Prompts
+from dior_rt.families.qwen.frame import Frame
+from dior_rt.families.qwen.model import Condition
+from dior_rt.families.qwen.template import Prompts
 
 AREA, VISION_AREA = 96 * 96, 64 * 64
 RECIPE = Recipe(

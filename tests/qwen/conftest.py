@@ -21,7 +21,7 @@ from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit_plus as edit_p
 
 from dior_rt.bundle import read_bundle
 from dior_rt.export.qwen.bundle import export_qwen
-from dior_rt.family.qwen import Qwen
+from dior_rt.families.qwen.model import Qwen
 
 Make = Callable[..., Path]
 

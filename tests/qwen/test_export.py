@@ -24,10 +24,10 @@ from dior_rt.errors import BundleError, DiorError, InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.graph import GraphWriter
 from dior_rt.export.qwen.lora import Lora
-from dior_rt.export.qwen.memory import peak
 from dior_rt.export.qwen.sources import Files, Sources
-from dior_rt.family.qwen import Qwen
-from dior_rt.schedule import ShiftSchedule
+from dior_rt.families.qwen.model import Qwen
+from dior_rt.flow.schedule import ShiftSchedule
+from tools.qwen_memory import peak
 
 
 @pytest.fixture

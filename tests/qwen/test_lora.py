@@ -17,7 +17,7 @@ from dior_rt.errors import InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.export.qwen.weights import Checkpoint, Merged
-from dior_rt.family.qwen import Qwen
+from dior_rt.families.qwen.model import Qwen
 
 
 def merged(folder, *loras):

@@ -18,9 +18,9 @@ from dior_rt.errors import InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.errors import probe_strokes, psnr, relative
 from dior_rt.export.qwen.lora import Lora
-from dior_rt.family.qwen import Qwen, pack, rescaled, unpack
+from dior_rt.families.qwen.model import Qwen, pack, rescaled, unpack
+from dior_rt.flow.sampler import draw_noise, sample
 from dior_rt.kernels import Strokes
-from dior_rt.sampler import draw_noise, sample
 
 PROMPT = "light it from the left"
 

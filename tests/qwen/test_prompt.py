@@ -16,10 +16,10 @@ from dior_rt.bundle import read_bundle
 from dior_rt.errors import InputError
 from dior_rt.export.qwen.sources import Sources
 from dior_rt.export.qwen.text import TextConfig
-from dior_rt.family.qwen import Qwen
-from dior_rt.family.qwen_frame import fit_area, resize
-from dior_rt.family.qwen_prompt import PromptEncoder, patchify, whole_patches, window_order
-from dior_rt.family.qwen_words import PICTURE, TEMPLATE
+from dior_rt.families.qwen.frame import fit_area, resize
+from dior_rt.families.qwen.model import Qwen
+from dior_rt.families.qwen.prompt import PromptEncoder, patchify, whole_patches, window_order
+from dior_rt.families.qwen.template import PICTURE, TEMPLATE
 
 WORDS = "light it from the left"
 

@@ -10,7 +10,7 @@ from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit_plus as edit_p
 from PIL import Image
 
 from dior_rt import Relighter
-from dior_rt.family.qwen_frame import shrink
+from dior_rt.families.qwen.frame import shrink
 
 
 def test_the_relighter_runs_a_qwen_bundle(make):

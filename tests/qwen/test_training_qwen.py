@@ -14,15 +14,15 @@ from dior_rt.cli import run
 from dior_rt.errors import InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.lora import Lora
-from dior_rt.family.mini import MODES
-from dior_rt.family.qwen import Qwen
-from dior_rt.family.qwen_config import LUMI_PEAK
+from dior_rt.families.mini import MODES
+from dior_rt.families.qwen.model import Qwen
+from dior_rt.families.qwen.settings import LUMI_PEAK
 from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.training import qwen as training
+from dior_rt.training.data.render import View
+from dior_rt.training.data.triplets import Batches, load_views
 from dior_rt.training.fit import Plan, flow_loss
-from dior_rt.training.render import View
 from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_own_strokes
-from dior_rt.training.triplets import Batches, load_views
 
 SAID = {MODES["relight"]: "light it from the left", MODES["estimate"]: "draw its light"}
 
@@ -155,8 +155,8 @@ def test_training_and_runtime_ask_the_same_network(qwens, prompts):
         with torch.no_grad():
             want = network(x, torch.tensor([0.5]), photo, light, None, torch.tensor([MODES[mode]]))
         references = torch.cat([training.pack(picture[0]) for picture in pictures]).numpy()
-        from dior_rt.family.qwen import Condition
-        from dior_rt.family.qwen_frame import Frame
+        from dior_rt.families.qwen.frame import Frame
+        from dior_rt.families.qwen.model import Condition
 
         sizes = ((4, 4),) * (1 + len(pictures))
         condition = Condition(mode, (64, 64), Frame.around((64, 64), 32), references, sizes, ())

@@ -12,9 +12,9 @@ from dior_rt.bundle import read_bundle
 from dior_rt.engine import Engine
 from dior_rt.export.qwen.errors import relative
 from dior_rt.export.qwen.graph import GraphWriter, quantize_int4
-from dior_rt.family.qwen import Condition, Qwen
-from dior_rt.family.qwen_frame import Frame
-from dior_rt.family.qwen_rope import joint_places, turns
+from dior_rt.families.qwen.frame import Frame
+from dior_rt.families.qwen.model import Condition, Qwen
+from dior_rt.families.qwen.rope import joint_places, turns
 
 # What one call may cost, relative to the output's norm, on random weights.
 BARS = {"fp32": 1e-5, "fp16": 2e-3, "int8": 5e-2, "int4": 2e-1}

@@ -8,7 +8,7 @@ import tiny_qwen
 import torch
 
 from dior_rt.export.qwen.errors import psnr
-from dior_rt.family.qwen_vae import decode_tiled, encode_tiled
+from dior_rt.families.qwen.vae import decode_tiled, encode_tiled
 
 
 @pytest.fixture(scope="module")

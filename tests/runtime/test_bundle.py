@@ -9,8 +9,8 @@ import pytest
 from dior_rt import bundle as bundles
 from dior_rt.bundle import Graph, Manifest, Tensor, read_bundle, write_bundle
 from dior_rt.errors import BundleError
+from dior_rt.flow.schedule import DynamicShiftSchedule, ShiftSchedule
 from dior_rt.grid import GridRule
-from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
 
 MANIFEST = Manifest(
     family="mini",

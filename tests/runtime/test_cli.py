@@ -16,9 +16,9 @@ from PIL import Image
 
 from dior_rt import __version__
 from dior_rt.cli import run
-from dior_rt.metadata import read_settings
-from dior_rt.pictures import Photo, read_photo, write_photo
-from dior_rt.strokes import read_lumi, read_strokes
+from dior_rt.images.metadata import read_settings
+from dior_rt.images.photo import Photo, read_photo, write_photo
+from dior_rt.images.strokes import read_lumi, read_strokes
 
 HEIGHT, WIDTH = 40, 60
 
@@ -103,7 +103,7 @@ def test_a_seed_is_a_result(relight) -> None:
 
 
 def test_the_same_light_in_every_format_is_the_same_result(relight) -> None:
-    from dior_rt.exr import write_exr
+    from dior_rt.images.exr import write_exr
     from dior_rt.kernels import NumpyOps
 
     raster = read_strokes(Path("strokes.png"), (HEIGHT, WIDTH))

@@ -12,7 +12,7 @@ for package in (dior_rt, dior_rt.kernels):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         if not module.name.startswith(OTHERS):
             importlib.import_module(module.name)
-assert {"dior_rt.cli.app", "dior_rt.family.mini", "dior_rt.kernels.opencl_ops"} <= sys.modules.keys()
+assert {"dior_rt.cli.app", "dior_rt.families.mini", "dior_rt.kernels.opencl_ops"} <= sys.modules.keys()
 dior_rt.Relighter
 extras = "torch onnx onnxscript safetensors peft accelerate mitsuba diffusers transformers".split()
 print(*(name for name in extras if name in sys.modules))

@@ -15,11 +15,11 @@ from dior_rt.bench.promise import write_presets
 from dior_rt.bundle import Bundle, read_bundle
 from dior_rt.cli import run
 from dior_rt.errors import BundleError, InputError
+from dior_rt.flow.sampler import sample
+from dior_rt.flow.schedule import DynamicShiftSchedule
 from dior_rt.kernels import Stroke
 from dior_rt.presets import PRESETS, Preset, Sampling, read_presets, sampling
 from dior_rt.relight import Relighter
-from dior_rt.sampler import sample
-from dior_rt.schedule import DynamicShiftSchedule
 
 FAST = Preset(2, "adams", 5.0, (0.9, 1.0))
 

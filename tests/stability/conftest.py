@@ -22,7 +22,7 @@ from dior_rt import Relighter
 from dior_rt.bundle import Bundle, default_bundle, read_bundle, write_bundle
 from dior_rt.engine import Engine
 from dior_rt.export.check import run
-from dior_rt.family.mini import SEEN, Graphs, Mini
+from dior_rt.families.mini import SEEN, Graphs, Mini
 from dior_rt.grid import GridRule
 
 INPUTS = ("x", "sigma", "mode", *SEEN)

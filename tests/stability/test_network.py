@@ -16,7 +16,7 @@ import twin
 from dior_rt.engine import Engine, Feeds
 from dior_rt.export.qwen.graph import GraphWriter
 from dior_rt.export.qwen.transformer import TransformerConfig, write_block
-from dior_rt.family.qwen_rope import joint_places, turns
+from dior_rt.families.qwen.rope import joint_places, turns
 
 VELOCITY = {"fp32": 1e-5, "fp16": 2e-2, "int8": 2e-1}
 BLOCK = {"fp32": 1e-5, "fp16": 3e-3, "int8": 6e-2}

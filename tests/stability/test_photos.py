@@ -23,12 +23,12 @@ from PIL import ExifTags, Image
 
 from dior_rt.bundle import default_bundle, read_bundle
 from dior_rt.errors import InputError
-from dior_rt.family.mini import Mini
+from dior_rt.families.mini import Mini
+from dior_rt.images.arrays import BRIGHTEST
+from dior_rt.images.photo import read_photo, write_photo
 from dior_rt.kernels import Strokes
-from dior_rt.pictures import read_photo, write_photo
-from dior_rt.pixels import BRIGHTEST
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "runtime"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "runtime" / "images"))
 import icc
 
 CODES = {"fp32": 0.6, "fp16": 2.0, "int8": 10.0}

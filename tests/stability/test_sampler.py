@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import twin
 
-from dior_rt.family.qwen import rescaled
-from dior_rt.sampler import draw_noise, guide, guided, sample
-from dior_rt.schedule import DynamicShiftSchedule, ShiftSchedule
-from dior_rt.solvers import MEMORY, SOLVERS
+from dior_rt.families.qwen.model import rescaled
+from dior_rt.flow.sampler import draw_noise, guide, guided, sample
+from dior_rt.flow.schedule import DynamicShiftSchedule, ShiftSchedule
+from dior_rt.flow.solvers import MEMORY, SOLVERS
 
 NOISE = draw_noise(3, (256,))
 EVEN = ShiftSchedule(1.0)

@@ -19,10 +19,10 @@ from onnx.reference import ReferenceEvaluator
 from onnx.reference.op_run import OpRun
 
 from dior_rt.bundle import Bundle
-from dior_rt.family import Family
-from dior_rt.family.mini import MODES, null
+from dior_rt.families import Family
+from dior_rt.families.mini import MODES, null
+from dior_rt.flow.sampler import draw_noise
 from dior_rt.kernels import Strokes
-from dior_rt.sampler import draw_noise
 
 Array = NDArray[np.float64]
 Velocity = Callable[[Array, float], Array]

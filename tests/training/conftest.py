@@ -9,7 +9,7 @@ import pytest
 @pytest.fixture(scope="session")
 def renders(tmp_path_factory) -> Path:
     """The folder of three scenes, two views each, of 24 x 24 pixels; not to be changed."""
-    from dior_rt.training import render
+    from dior_rt.training.data import render
 
     folder = tmp_path_factory.mktemp("renders")
     with pytest.MonkeyPatch.context() as patch:
@@ -20,6 +20,6 @@ def renders(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def views(renders):
-    from dior_rt.training.triplets import load_views
+    from dior_rt.training.data.triplets import load_views
 
     return load_views(renders)

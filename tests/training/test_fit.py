@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 
 from dior_rt.errors import InputError
 from dior_rt.export.lora import merge_lora
+from dior_rt.training.data.triplets import Batches
 from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss, response_loss
 from dior_rt.training.network import (
     BOUNCED,
@@ -24,7 +25,6 @@ from dior_rt.training.network import (
     save_network,
     srgb_to_linear,
 )
-from dior_rt.training.triplets import Batches
 
 TINY = Config(width=32, depth=1, heads=2, patch=8, fine=4, half=8, quarter=16)
 SHORT = Plan(steps=6, batch=2, rate=2e-3, warmup=2, average=2, save_every=2)

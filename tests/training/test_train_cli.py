@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from dior_rt.cli import run
-from dior_rt.training import render
+from dior_rt.training.data import render
 from dior_rt.training.network import Config, Mini, load_network, save_network
 
 SIZE = ("--width", "16", "--depth", "1", "--heads", "2", "--batch", "2")

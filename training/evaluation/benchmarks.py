@@ -17,11 +17,11 @@ import numpy as np
 from numpy.random import Generator
 
 from dior_rt.errors import InputError
-from dior_rt.strokes import read_lumi
+from dior_rt.images.strokes import read_lumi
+from dior_rt.training.data.render import View
+from dior_rt.training.data.triplets import Pair, interest, pair
 from dior_rt.training.evaluation.layouts import multi_illum, read_picture, rene
 from dior_rt.training.evaluation.tasks import OPS, Benchmark, Task
-from dior_rt.training.render import View
-from dior_rt.training.triplets import Pair, interest, pair
 
 HEAD: Final = "synthbench.json"
 LAST: Final = "target.png"  # what is written last of a pair: where it is, the pair is whole

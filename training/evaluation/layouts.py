@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from dior_rt.errors import InputError
-from dior_rt.exr import read_exr
-from dior_rt.pictures import read_photo
+from dior_rt.images.exr import read_exr
+from dior_rt.images.photo import read_photo
 from dior_rt.training.evaluation.metrics import Photo
 from dior_rt.training.evaluation.tasks import OPS, Benchmark, Task
 

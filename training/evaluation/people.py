@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from dior_rt.errors import InputError, MissingExtraError
 from dior_rt.files import reason
-from dior_rt.training.scenes import Material, Thing
-from dior_rt.training.shapes import Mesh
-from dior_rt.training.textures import texture
+from dior_rt.training.scenes.scene import Material, Thing
+from dior_rt.training.scenes.shapes import Mesh
+from dior_rt.training.scenes.textures import texture
 
 DESCENTS: Final = ("african", "asian", "caucasian")
 SEXES: Final = ("female", "male")

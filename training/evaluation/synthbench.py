@@ -28,17 +28,17 @@ from numpy.typing import NDArray
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, replacing
-from dior_rt.pictures import Photo, write_photo
+from dior_rt.images.photo import Photo, write_photo
+from dior_rt.images.strokes import write_lumi
 from dior_rt.records import parse, read_json
-from dior_rt.strokes import write_lumi
+from dior_rt.training.data.render import DOMAINS, Stage, View, lit, mitsuba, view
+from dior_rt.training.data.triplets import Pair, pair, random_lights, usable_sources
 from dior_rt.training.evaluation.benchmarks import HEAD, LAST
 from dior_rt.training.evaluation.metrics import Photo as Shown
 from dior_rt.training.evaluation.metrics import psnr, speckle
 from dior_rt.training.evaluation.people import person
 from dior_rt.training.evaluation.tasks import OPS, Task
-from dior_rt.training.render import DOMAINS, Stage, View, lit, mitsuba, view
-from dior_rt.training.scenes import Camera, Scene
-from dior_rt.training.triplets import Pair, pair, random_lights, usable_sources
+from dior_rt.training.scenes.scene import Camera, Scene
 
 MOST_COPY: Final = 15.0  # dB
 DRAWS: Final = 200  # of lights in a scene, before the next scene is tried

@@ -1,0 +1,140 @@
+"""Mini: the small network that ships in the package. It predicts light on a grid of some 64 x 64 cells.
+
+Data variable x0 of the flow: 4 (relit - photo) to relight, 2 encode(Lumi map) - 1 to estimate, where relit
+and photo are sRGB-encoded and encode(L) = log(1 + 8 L) / log 9: in both, squared error is what the eye sees.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from dior_rt.bundle import Bundle
+from dior_rt.engine import Engine, open_engine
+from dior_rt.errors import BundleError
+from dior_rt.families import Mode
+from dior_rt.flow.sampler import Array, Condition, Velocity, guided
+from dior_rt.flow.schedule import ShiftSchedule
+from dior_rt.kernels import Strokes
+
+MODES: Final[dict[Mode, int]] = {"relight": 0, "estimate": 1}
+RELIT_SCALE: Final = np.float32(4)
+LUMI_SCALE: Final = np.float32(8)
+SEEN: Final = ("photo", "light", "mask")  # of a condition, what the graph "encode" looks at
+
+
+class Mini:
+    """A mini bundle, loaded on a device: the `Family` whose condition is the network's inputs, by name."""
+
+    def __init__(self, bundle: Bundle, device: str = "auto", threads: int | None = None) -> None:
+        """Raises BundleError for a bundle that is no complete mini, and what `open_engine` raises."""
+        grid, schedule = bundle.manifest.grid, bundle.manifest.schedule
+        if bundle.manifest.family != "mini" or grid is None or not isinstance(schedule, ShiftSchedule):
+            raise BundleError(f"{bundle.folder} is no complete bundle of the family mini.")
+        self._grid, self._schedule = grid, schedule
+        velocity = open_engine(bundle, "velocity", device, threads)
+        self._graphs = Graphs(
+            encode=open_engine(bundle, "encode", velocity.device, threads, keep=False), velocity=velocity
+        )
+        self.device, self.reason = velocity.device, velocity.reason
+
+    def raster(self, height: int, width: int) -> tuple[int, int]:
+        return self._grid.shape(height, width)
+
+    def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
+        return encode(photo, strokes, mode)
+
+    def noise_shape(self, condition: Condition) -> tuple[int, ...]:
+        return condition["photo"].shape
+
+    def sigmas(self, steps: int, condition: Condition) -> Array:
+        return self._schedule.sigmas(steps)
+
+    def velocity(self, condition: Condition, sigmas: Array, guidance: float) -> Velocity:
+        return self._graphs.guided(condition, guidance)
+
+    def decode_relit(self, x0: Array, condition: Condition) -> Array:
+        return _pixels(np.clip(condition["photo"] + x0 / RELIT_SCALE, 0, 1))
+
+    def decode_lumi(self, x0: Array, condition: Condition) -> Array:
+        encoded = np.maximum((_pixels(x0) + 1) / 2, 0)
+        return np.expm1(encoded * np.log1p(LUMI_SCALE)) / LUMI_SCALE
+
+
+def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
+    """The network's inputs for one photo (h, w, 3), sRGB 0..1, and strokes of the same grid, or None."""
+    nothing = Strokes(np.zeros_like(photo), np.zeros(photo.shape[:2], np.float32))
+    strokes = strokes or nothing
+    return {
+        "photo": _planes(photo),
+        "light": _planes(np.where(strokes.mask[..., None] > 0, strokes.light, 0)),
+        "mask": _planes(strokes.mask[..., None]),
+        "mode": np.array([MODES[mode]], np.int64),
+    }
+
+
+def null(condition: Condition) -> Condition:
+    """The condition without its strokes: the null branch of guidance."""
+    return {**condition, **{name: np.zeros_like(condition[name]) for name in ("light", "mask")}}
+
+
+class Graphs:
+    """Mini's two graphs. encode: what photo and strokes say, run once; velocity: run at every step.
+
+    What the photo alone says is remembered until another comes: who paints draws on one photo many times.
+    """
+
+    def __init__(self, encode: Engine, velocity: Engine) -> None:
+        self.encode, self.velocity = encode, velocity
+        self._blank, self._own_light = lru_cache(1)(self._look), lru_cache(1)(self._estimate)
+
+    def guided(self, condition: Condition, guidance: float) -> Velocity:
+        """The velocity under a condition, and guided away from none: see `dior_rt.flow.sampler.guided`."""
+        drawn, blank = self.branches(condition)
+        return guided(self.bind, drawn, blank, guidance)
+
+    def bind(self, features: Condition) -> Velocity:
+        """The velocity by features, which go to the device once."""
+        binding = self.velocity.bind(features)
+
+        def velocity(x: Array, sigma: float) -> Array:
+            return binding.run({"x": x, "sigma": np.full(len(x), sigma, np.float32)})["velocity"]
+
+        return velocity
+
+    def branches(self, condition: Condition) -> tuple[Condition, Condition]:
+        """What a step is told of photo and strokes, and of the photo alone."""
+        mode, seen = {"mode": condition["mode"]}, {name: condition[name] for name in SEEN}
+        photo = seen["photo"].shape, seen["photo"].tobytes()
+        blank = drawn = self._blank(*photo)
+        if seen["mask"].any():
+            drawn = self.encode.run({**seen, "own": self._own_light(*photo)})
+        return {**mode, **drawn}, {**mode, **blank}
+
+    def _look(self, shape: tuple[int, ...], photo: bytes) -> Condition:
+        """What the graph "encode" says of a photo alone."""
+        pixels = np.frombuffer(photo, np.float32).reshape(shape)
+        seen = {"photo": pixels, "light": np.zeros_like(pixels), "mask": np.zeros_like(pixels[:, :1])}
+        return self.encode.run({**seen, "own": np.zeros_like(pixels)})
+
+    def _estimate(self, shape: tuple[int, ...], photo: bytes) -> Array:
+        """The light on a photo, encoded, which what is drawn is measured against: an evaluation without
+        strokes from a silent state."""
+        asked: Condition = {
+            "x": np.zeros(shape, np.float32),
+            "sigma": np.ones(shape[0], np.float32),
+            "mode": np.full(shape[0], MODES["estimate"], np.int64),
+        }
+        velocity: Array = self.velocity.run({**asked, **self._blank(shape, photo)})["velocity"]
+        # From x = 0 at sigma = 1 it is -x0, and x0 is 2 own - 1.
+        return (np.float32(1) - velocity) / np.float32(2)
+
+
+def _planes(pixels: Array) -> Array:
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], np.float32)
+
+
+def _pixels(planes: Array) -> Array:
+    return np.ascontiguousarray(planes[0].transpose(1, 2, 0))

@@ -1,0 +1,92 @@
+"""OpenEXR files of linear light, by the format's own library."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dior_rt.errors import InputError
+from dior_rt.files import check_readable, reason, replacing
+from dior_rt.images.photo import MOST_PIXELS
+
+
+def read_exr(path: Path, what: str) -> NDArray[np.float32]:
+    """The channels R, G, B and, where there is one, A of the first part as (H, W, 3 or 4) float32, unchanged.
+
+    The picture is the display window; what the data window leaves open is 0. what: how errors call the file.
+    Raises InputError for a file that is damaged, of more than MOST_PIXELS, or without those channels.
+    """
+    import OpenEXR
+
+    check_readable(path, what)
+    try:
+        with _hushed():
+            # The header first: a few bytes can promise a picture of any size.
+            header = OpenEXR.File(str(path), header_only=True).header()
+            shown, stored = _box(header["displayWindow"]), _box(header["dataWindow"])
+            if not all(0 < width * height <= MOST_PIXELS for _, _, width, height in (shown, stored)):
+                raise ValueError(f"it is empty, or has more than {MOST_PIXELS // 10**6} megapixels")
+            channels = OpenEXR.File(str(path), separate_channels=True).channels()
+            if not all(name in channels for name in "RGB"):
+                raise ValueError("it has no channels R, G and B")
+            planes = [channels[name].pixels for name in "RGBA" if name in channels]
+        data = np.stack(planes, axis=-1).astype(np.float32, copy=False)
+        return data if shown == stored else _frame(data, shown, stored)
+    except (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
+        raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
+
+
+def write_exr(path: Path, light: NDArray[np.float32]) -> None:
+    """Write (H, W, 3) linear light as float32 channels R, G and B, whole or not at all. Raises InputError."""
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing(path) as file, _hushed():
+        try:
+            OpenEXR.File(header, {"RGB": np.ascontiguousarray(light)}).write(file.name)
+        except RuntimeError as error:
+            raise InputError(f"Cannot write {path}: {reason(error)}.") from error
+
+
+Box = tuple[int, int, int, int]  # left, top, width, height
+
+
+def _box(window: Any) -> Box:
+    (left, top), (right, bottom) = (tuple(int(v) for v in corner) for corner in window)
+    return left, top, right - left + 1, bottom - top + 1
+
+
+def _frame(data: NDArray[np.float32], shown: Box, stored: Box) -> NDArray[np.float32]:
+    """The part of the stored box that is shown, in a picture of the shown box's size."""
+    picture = np.zeros((shown[3], shown[2], data.shape[2]), np.float32)
+    left, top = max(shown[0], stored[0]), max(shown[1], stored[1])
+    right, bottom = (
+        min(shown[0] + shown[2], stored[0] + stored[2]),
+        min(shown[1] + shown[3], stored[1] + stored[3]),
+    )
+    if left < right and top < bottom:
+        part = data[top - stored[1] : bottom - stored[1], left - stored[0] : right - stored[0]]
+        picture[top - shown[1] : bottom - shown[1], left - shown[0] : right - shown[0]] = part
+    return picture
+
+
+@contextlib.contextmanager
+def _hushed() -> Iterator[None]:
+    """Keep off the terminal what the library prints beside raising: C to stderr, Python to stdout."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+        with contextlib.suppress(OSError):  # a stream that is closed says nothing anyway
+            saved = os.dup(2)
+            stack.callback(os.close, saved)
+            stack.callback(os.dup2, saved, 2)
+            nothing = os.open(os.devnull, os.O_WRONLY)
+            stack.callback(os.close, nothing)
+            os.dup2(nothing, 2)
+        yield

@@ -1,0 +1,120 @@
+"""Pictures of 16 bits a channel, which Pillow holds in 8.
+
+Pillow opens, checks and unpacks PNG and TIFF of any kind, but its colour modes keep one byte a sample. Its
+decoders can be told which byte: read as big-endian a sample gives its high byte, read as little-endian its
+low one. Two passes over the file make the whole sample, with every compression, predictor, tiling and
+interlacing that Pillow knows. The packages that read such files outright (imagecodecs, OpenCV) weigh 25 to 60
+MB and write no profile, EXIF or text into a PNG.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+from collections.abc import Callable
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ImageFile, PngImagePlugin, TiffImagePlugin, TiffTags
+
+from dior_rt.images.icc import Pixels
+
+Deep = NDArray[np.uint16]
+
+#: How zlib packs, in every file: what prediction leaves of a photo's rows seldom repeats, and to look for
+#: more than runs of bytes costs time, and space too.
+STRATEGY = zlib.Z_RLE
+
+_ROWS = 64  # rows a strip: compressed one by one, so that a 100-megapixel picture needs no second copy
+
+
+def is_deep(image: ImageFile.ImageFile) -> bool:
+    """Whether an opened, not yet decoded picture has grey or RGB samples of 16 bits, pixel by pixel."""
+    if isinstance(image, TiffImagePlugin.TiffImageFile) and image.tag_v2.get(284) == 2:
+        return False  # plane by plane: Pillow has unpackers of its own for it
+    return image.mode.startswith("I;16") or (image.mode in ("RGB", "RGBA") and ";16" in _rawmode(image))
+
+
+def read_deep(open_image: Callable[[], ImageFile.ImageFile]) -> Deep:
+    """(H, W, channels) uint16; channels: 1 grey, 2 grey and alpha, 3 RGB, 4 RGB and alpha.
+
+    open_image opens the same picture anew each time. Raises what Pillow raises for a damaged file.
+    """
+    image = open_image()
+    rawmode = _rawmode(image)
+    if image.mode.startswith("I;16"):
+        samples = np.asarray(image).astype(np.uint16)[..., None]
+        white_is_zero = isinstance(image, TiffImagePlugin.TiffImageFile) and image.tag_v2.get(262) == 0
+        return ~samples if white_is_zero else samples
+    if rawmode == "LA;16B":  # 32 bits a pixel, as RGBA's four bytes are
+        return _bytes_of(image, "RGBA").view(">u2").astype(np.uint16)
+    # A premultiplied sample must not be divided byte by byte.
+    layout = rawmode.partition(";")[0].upper()
+    high, low = (_bytes_of(open_image(), f"{layout};16{end}").astype(np.uint16) for end in "BL")
+    if rawmode[-1] == "L" or (rawmode[-1] == "N" and sys.byteorder == "little"):
+        high, low = low, high
+    samples = high << np.uint16(8) | low
+    return _unpremultiplied(samples) if rawmode.startswith("RGBa") else samples
+
+
+def write_png(file: IO[bytes], samples: Deep, info: PngImagePlugin.PngInfo) -> None:
+    """A PNG of (H, W, 3 or 4) uint16 samples, with info's chunks ahead of the pixels."""
+    height, width, channels = samples.shape
+    file.write(b"\x89PNG\r\n\x1a\n")
+    header = struct.pack(">2I5B", width, height, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
+    PngImagePlugin.putchunk(file, b"IHDR", header)
+    for name, data, *_ in info.chunks:
+        PngImagePlugin.putchunk(file, name, data)
+    packer = zlib.compressobj(strategy=STRATEGY)
+    above = np.zeros((1, width * channels * 2), np.uint8)
+    for top in range(0, height, _ROWS):
+        rows = samples[top : top + _ROWS].astype(">u2").view(np.uint8).reshape(-1, above.shape[1])
+        filtered = rows - np.concatenate([above, rows[:-1]])  # filter 2, "up": less the byte above
+        above = rows[-1:]
+        PngImagePlugin.putchunk(file, b"IDAT", packer.compress(np.insert(filtered, 0, 2, axis=1).tobytes()))
+    PngImagePlugin.putchunk(file, b"IDAT", packer.flush())
+    PngImagePlugin.putchunk(file, b"IEND")
+
+
+def write_tiff(file: IO[bytes], samples: Pixels, tags: TiffImagePlugin.ImageFileDirectory_v2) -> None:
+    """A TIFF of (H, W, 3 or 4) uint8 or uint16 samples, deflated as differences, with further tags."""
+    height, width, channels = samples.shape
+    strips = []
+    for top in range(0, height, _ROWS):
+        rows = samples[top : top + _ROWS].copy()
+        rows[:, 1:] -= samples[top : top + _ROWS, :-1]
+        packer = zlib.compressobj(strategy=STRATEGY)
+        strips.append(packer.compress(rows.astype(rows.dtype.newbyteorder("<")).tobytes()) + packer.flush())
+    lengths = tuple(len(strip) for strip in strips)
+    tags[256], tags[257], tags[258] = width, height, (8 * samples.itemsize,) * channels
+    tags[259], tags[262], tags[277], tags[317] = 8, 2, channels, 2  # deflate, RGB, samples a pixel, predictor
+    tags[278], tags[279] = _ROWS, lengths
+    tags[273] = tuple(sum(lengths[:i]) for i in range(len(lengths)))  # save() counts them from its own end
+    tags.tagtype[273] = tags.tagtype[279] = TiffTags.LONG
+    if channels == 4:
+        tags[338] = 2  # the alpha is not multiplied in
+    tags.save(file)
+    file.writelines(strips)
+
+
+def _rawmode(image: ImageFile.ImageFile) -> str:
+    """The name of the unpacker that Pillow would use, such as "RGB;16B"."""
+    args = image.tile[0].args if image.tile else None
+    return str(args[0] if isinstance(args, tuple) else args)
+
+
+def _bytes_of(image: ImageFile.ImageFile, rawmode: str) -> NDArray[np.uint8]:
+    """The picture decoded by another unpacker of as many bits a pixel."""
+    image.tile = [
+        tile._replace(args=(rawmode, *tile.args[1:]) if isinstance(tile.args, tuple) else rawmode)
+        for tile in image.tile
+    ]
+    return np.array(image)
+
+
+def _unpremultiplied(samples: Deep) -> Deep:
+    alpha = np.maximum(samples[..., 3:], 1)
+    colour = np.minimum(samples[..., :3].astype(np.uint32) * 65535 // alpha, 65535).astype(np.uint16)
+    return np.concatenate([colour, samples[..., 3:]], axis=-1)

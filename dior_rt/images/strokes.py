@@ -1,0 +1,255 @@
+"""Strokes and Lumi maps in and out of files. docs and README call these the ways to draw light.
+
+    strokes.png    RGBA: where alpha > 0 light is specified, and the colour is that light, sRGB-encoded
+    map.png        RGB (any picture): light is specified everywhere, or with key "black" wherever it is not
+    black map.exr        float RGB, linear light; with A: A > 0 is specified, and RGB is multiplied by A, as
+    EXR has it map.npy        float (H, W, 3) linear light, or (H, W, 4) with the mask 0..1 as the fourth
+    channel strokes.json   strokes as lines: [stroke, ...] or {"size": [width, height], "strokes": [stroke,
+    ...]}
+
+    project.dior        the lights of a project of the light desk: see `dior_rt.project`
+
+A stroke in JSON is {"points": [[x, y], ...], "width": pixels} and, where wanted, "color": "#rrggbb" (sRGB) or
+[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1, "blend": "set", "add" or "multiply", see
+`dior_rt.lights`. Coordinates are pixels of "size", or else of the photo as it is seen; (0, 0) is the upper
+left corner.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dior_rt import project
+from dior_rt.errors import InputError
+from dior_rt.files import check_readable, check_writable, reason, replacing
+from dior_rt.images.arrays import check_same_shape
+from dior_rt.images.exr import read_exr, write_exr
+from dior_rt.images.photo import MOST_PIXELS, Photo, check_output, read_photo, write_photo
+from dior_rt.kernels import NumpyOps, Stroke, Strokes
+from dior_rt.kernels.color import srgb_to_linear
+from dior_rt.lights import BLENDS, Blend, Light
+from dior_rt.records import read_json
+
+Key = Literal["black"]
+
+_MOST_JSON_BYTES = 16 << 20
+
+
+def read_strokes(
+    path: Path, photo_size: tuple[int, int], key: Key | None = None
+) -> NDArray | list[Stroke] | list[Light]:
+    """Strokes from a file of any kind above, ready for `Relighter.relight`.
+
+    photo_size: (height, width) of the photo. key: "black" reads pixels that are exactly black as unspecified.
+    A raster comes as (H, W, 4): uint8 or uint16, sRGB-encoded, or float32, linear; the last channel is the
+    mask. JSON comes as strokes in the photo's pixels, or as lights where any of them blends; a project as its
+    lights. Raises InputError for what cannot be read or makes no sense.
+    """
+    if path.suffix.lower() == project.SUFFIX:
+        return project.lights_of(project.read_project(path), photo_size)
+    if path.suffix.lower() == ".json":
+        return _read_json(path, photo_size)
+    raster = _read_raster(path, "strokes")
+    if key == "black":
+        raster[..., 3] *= (raster[..., :3] != 0).any(axis=-1)
+    return raster
+
+
+def read_lumi(path: Path) -> NDArray[np.float32]:
+    """A dense Lumi map (H, W, 3), linear float32 >= 0, from any raster above; pictures are decoded from sRGB.
+
+    Raises InputError, also for a map that leaves pixels unspecified.
+    """
+    raster = _read_raster(path, "Lumi map")
+    light, mask = raster[..., :3], raster[..., 3]
+    if not mask.all():
+        raise InputError(f"The Lumi map {path} leaves pixels unspecified; a Lumi map speaks of all of them.")
+    if light.dtype != np.float32:
+        light = NumpyOps().decode_srgb(light)
+    return np.ascontiguousarray(light)
+
+
+def check_lumi_output(path: Path) -> None:
+    """Raise InputError where `write_lumi` would fail, as far as can be known."""
+    if path.suffix.lower() in (".npy", ".exr"):
+        check_writable(path)
+    else:
+        check_output(path, Photo(np.zeros((1, 1, 3), np.uint8)))
+
+
+def write_lumi(path: Path, lumi: NDArray[np.float32], settings: Mapping[str, Any]) -> None:
+    """Write a Lumi map (H, W, 3): .npy and .exr keep it, a picture shows it, clipped to display white."""
+    if path.suffix.lower() == ".npy":
+        _write_npy(path, lumi)
+    elif path.suffix.lower() == ".exr":
+        write_exr(path, lumi)
+    else:
+        write_photo(path, Photo(NumpyOps().encode_srgb(lumi, np.uint8)), settings)
+
+
+def check_strokes_output(path: Path) -> None:
+    """Raise InputError where `write_strokes` would fail, as far as can be known."""
+    if path.suffix.lower() not in (".png", ".npy"):
+        raise InputError(f"Cannot write {path}: the name of strokes must end in .png or .npy.")
+    check_writable(path)
+
+
+def write_strokes(path: Path, strokes: Strokes, settings: Mapping[str, Any]) -> None:
+    """Write strokes: .npy (H, W, 4) keeps them, an RGBA .png holds 8 bits, up to display white."""
+    check_strokes_output(path)
+    if path.suffix.lower() == ".npy":
+        return _write_npy(path, np.dstack([strokes.light, strokes.mask]))
+    alpha = np.round(strokes.mask * 255).astype(np.uint8)
+    write_photo(path, Photo(NumpyOps().encode_srgb(strokes.light, np.uint8), alpha), settings)
+
+
+def _read_raster(path: Path, what: str) -> NDArray:
+    """(H, W, 4) light and mask; see `read_strokes`."""
+    suffix = path.suffix.lower()
+    if suffix not in (".npy", ".exr"):
+        return _read_picture(path, what)
+    raster = (_read_npy if suffix == ".npy" else read_exr)(path, what)
+    if raster.shape[2] == 3:
+        raster = np.concatenate([raster, np.ones_like(raster[..., :1])], axis=-1)
+    elif suffix == ".exr":
+        np.divide(raster[..., :3], raster[..., 3:], out=raster[..., :3], where=raster[..., 3:] > 0)
+    mask = raster[..., 3]
+    if not (mask.min() >= 0 and mask.max() <= 1):
+        raise InputError(f"The mask of the {what} {path} must lie in 0..1.")
+    drawn = raster[mask > 0]
+    if not (np.isfinite(drawn).all() and (drawn >= 0).all()):
+        raise InputError(f"The light of the {what} {path} must be finite and not negative.")
+    return raster
+
+
+def _read_picture(path: Path, what: str) -> NDArray:
+    photo = read_photo(path, what)
+    if photo.alpha is None:
+        mask = np.full(photo.size, np.iinfo(photo.pixels.dtype).max, photo.pixels.dtype)
+    elif photo.alpha.dtype != photo.pixels.dtype:
+        mask = photo.alpha.astype(np.uint16) * np.uint16(257)
+    else:
+        mask = photo.alpha
+    return np.dstack([photo.pixels, mask])
+
+
+def _read_npy(path: Path, what: str) -> NDArray[np.float32]:
+    check_readable(path, what)
+    try:
+        # Mapped, so that a header which promises more than the file holds takes no memory.
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if array.ndim != 3 or array.shape[2] not in (3, 4) or array.size == 0:
+            raise ValueError(f"it must be an array (rows, columns, 3 or 4), not {array.shape}")
+        if array.dtype.kind != "f":
+            raise ValueError(f"its light must be floating-point and linear, not {array.dtype}")
+        if array.shape[0] * array.shape[1] > MOST_PIXELS:
+            raise ValueError(f"it has more than {MOST_PIXELS // 10**6} megapixels")
+        with np.errstate(over="ignore"):  # too large for float32 becomes infinite, and that is refused
+            return np.array(array, np.float32)
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, MemoryError) as error:
+        raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
+
+
+def _write_npy(path: Path, array: NDArray[np.float32]) -> None:
+    with replacing(path) as file:
+        np.save(file, array.astype(np.float32, copy=False), allow_pickle=False)
+
+
+def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke] | list[Light]:
+    check_readable(path, "strokes")
+    try:
+        document = read_json(path, _MOST_JSON_BYTES)
+        scale = (1.0, 1.0)
+        if isinstance(document, dict):
+            _check_keys(document, known={"size", "strokes"}, needed={"strokes"})
+            scale = _scale(document["size"], photo_size) if "size" in document else scale
+            document = document["strokes"]
+        if not isinstance(document, list):
+            raise ValueError("it must be a list of strokes")
+        strokes, blends = [], []
+        for i, item in enumerate(document, 1):
+            try:
+                strokes.append(_parse_stroke(item, scale))
+                blends.append(_blend(item))
+            except (ValueError, OverflowError) as error:
+                raise ValueError(f"stroke {i}: {error}") from error
+        return _layers(strokes, blends) if set(blends) - {"set"} else strokes
+    except (OSError, ValueError, OverflowError) as error:
+        raise InputError(f"Cannot read the strokes {path}: {reason(error)}.") from error
+
+
+def _blend(item: dict[str, Any]) -> Blend:
+    blend = item.get("blend", "set")
+    if blend not in BLENDS:
+        raise ValueError(f"blend must be one of {', '.join(BLENDS)}, not {blend!r:.40}")
+    return blend
+
+
+def _layers(strokes: list[Stroke], blends: list[Blend]) -> list[Light]:
+    """Strokes that follow one another with the same blend are one layer."""
+    runs = groupby(zip(blends, strokes, strict=True), key=itemgetter(0))
+    return [Light(tuple(stroke for _, stroke in run), blend) for blend, run in runs]
+
+
+def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
+    """Pixels of the photo in one of the drawing's, across and down."""
+    (columns, rows), (height, width) = _numbers(size, 2, "size"), photo_size
+    if not min(columns, rows) >= 1:
+        raise ValueError("size must be [width, height] in pixels")
+    check_same_shape((round(rows), round(columns)), photo_size)
+    return width / columns, height / rows
+
+
+def _parse_stroke(item: Any, scale: tuple[float, float]) -> Stroke:
+    if not isinstance(item, dict):
+        raise ValueError("it must be an object with points and a width")
+    _check_keys(item, known={"points", "width", "blend", *_OPTIONAL}, needed={"points", "width"})
+    if not isinstance(item["points"], list):
+        raise ValueError("points must be a list of [x, y]")
+    points = [_numbers(point, 2, "each point") for point in item["points"]]
+    return Stroke(
+        points=tuple((x * scale[0], y * scale[1]) for x, y in points),
+        width=_number(item["width"], "width") * math.sqrt(scale[0] * scale[1]),
+        **{name: parse(item[name], name) for name, parse in _OPTIONAL.items() if name in item},
+    )
+
+
+def _color(value: Any, what: str) -> tuple[float, ...]:
+    """Linear RGB of "#rrggbb", which is sRGB, or of [r, g, b], which is linear already."""
+    if not isinstance(value, str):
+        return tuple(_numbers(value, 3, what))
+    if not re.fullmatch(r"#[0-9a-fA-F]{6}", value):
+        raise ValueError(f"{what} must be #rrggbb or [r, g, b], not {value!r:.40}")
+    codes = np.frombuffer(bytes.fromhex(value[1:]), np.uint8)
+    return tuple(float(v) for v in srgb_to_linear(codes / 255))
+
+
+def _numbers(value: Any, count: int, what: str) -> list[float]:
+    if not isinstance(value, list) or len(value) != count:
+        raise ValueError(f"{what} must be a list of {count} numbers")
+    return [_number(item, what) for item in value]
+
+
+def _number(value: Any, what: str) -> float:
+    if type(value) not in (int, float):
+        raise ValueError(f"{what} must be made of numbers, not {value!r:.40}")
+    return float(value)
+
+
+_OPTIONAL: dict[str, Callable[[Any, str], Any]] = {"color": _color, "intensity": _number, "softness": _number}
+
+
+def _check_keys(document: dict[str, Any], known: set[str], needed: set[str]) -> None:
+    if unknown := sorted(document.keys() - known):
+        raise ValueError(f"the key {unknown[0]!r} is unknown; known are {', '.join(sorted(known))}")
+    if missing := sorted(needed - document.keys()):
+        raise ValueError(f"the key {missing[0]!r} is missing")

@@ -1,0 +1,1 @@
+"""Random scenes as plain data: shapes, textures, skies, and the builders that put them together."""

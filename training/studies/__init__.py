@@ -1,0 +1,1 @@
+"""Studies: small networks trained side by side to compare one choice at a time."""
