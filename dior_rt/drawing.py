@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from dior_rt.flow.sampler import Array
 from dior_rt.kernels import Strokes
 
 #: Pixels of the longer side on which shapes are drawn: far finer than a light grid, and bounded.
@@ -32,6 +32,7 @@ CANVAS: Final = 768
 LIGHTEST: Final = 0.1
 
 Point = tuple[float, float]
+Array = NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,8 @@ class Canvas:
         """The drawing as light and mask."""
         mask = np.clip(self._mask, 0, 1)
         weight = np.where(mask > 0, mask, 1)[..., None]
-        return Strokes(np.maximum(self._light, 0) / weight, mask)
+        light = np.maximum(self._light, 0) / weight
+        return Strokes(light.astype(np.float32), mask.astype(np.float32))
 
 
 def draw(shapes: Sequence[Shape], photo: tuple[int, int], longest: int = CANVAS) -> Strokes:

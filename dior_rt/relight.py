@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -439,7 +439,8 @@ class OpenPhoto:
             if reach is not None:
                 lights = [replace(light, reach=light.reach or reach) for light in lights]
             return self._compose(lights, intensity)
-        drawn = self._relighter._reduce_strokes(lights, self.size, self._raster, intensity)
+        strokes = cast("Strokes | Sequence[Stroke] | Picture", lights)
+        drawn = self._relighter._reduce_strokes(strokes, self.size, self._raster, intensity)
         near = None if reach is None else closeness(drawn.mask > 0, reach)
         return Composed(drawn, near)
 
@@ -476,7 +477,13 @@ def _to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
 
 
 def _are_layers(lights: Drawing) -> TypeGuard[Sequence[Light]]:
-    return isinstance(lights, Sequence) and bool(lights) and all(isinstance(one, Light) for one in lights)
+    """Tell layers from the other ways to draw. Raises InputError for a mixture."""
+    if not isinstance(lights, Sequence):
+        return False
+    layers = [isinstance(one, Light) for one in lights]
+    if any(layers) and not all(layers):
+        raise InputError("Give either strokes or lights, not both in one list.")
+    return any(layers)
 
 
 def _linear(encoded: Array) -> Array:
