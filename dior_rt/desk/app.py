@@ -132,14 +132,14 @@ def _add_light(app: FastAPI, studio: Studio) -> None:
     async def preview(
         request: Request, photo: str, page: str = "", number: int = 0, longest: int = 1024
     ) -> Response:
-        """A JPEG of the photo under the project's lights; 409 where the page has asked again since."""
+        """A JPEG of the photo under the project's lights; 204 where the page has asked again since."""
         shown, is_newest = _photo(studio, photo), studio.newest.note(page[:64], number)
         project = await _project(request)
         size = min(max(longest, 16), MOST_PREVIEW)
         try:
             jpeg, notice = await run_in_threadpool(studio.preview, shown, project, size, is_newest)
-        except Cancelled as error:
-            raise HTTPException(409, str(error)) from error
+        except Cancelled:
+            return Response(status_code=204)
         return Response(jpeg, media_type="image/jpeg", headers={"X-Nothing-Drawn": "1"} if notice else None)
 
     @app.get("/api/photos/{photo}/source")

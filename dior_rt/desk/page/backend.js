@@ -49,12 +49,8 @@ export class HttpBackend {
 
   async preview(id, project, longest) {
     const number = ++this.#number;
-    try {
-      return await this.#blob(`api/photos/${id}/preview?page=${this.#page}&number=${number}&longest=${longest}`, post(project));
-    } catch (error) {
-      if (error.status === 409) return null;
-      throw error;
-    }
+    const response = await this.#call(`api/photos/${id}/preview?page=${this.#page}&number=${number}&longest=${longest}`, post(project));
+    return response.status === 204 ? null : response.blob();
   }
 
   source(id) {
