@@ -19,7 +19,10 @@ def desk(
         Path | None,
         typer.Argument(metavar="[PHOTO]", help="A photo to begin with; the page opens others too."),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="The port; 0 takes a free one.")] = 0,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="The port; 0 takes a free one [default: 8642, or a free one]."),
+    ] = None,
     browser: Annotated[
         bool,
         typer.Option("--browser/--no-browser", help="Open the page in the browser, or print its link only."),
@@ -36,7 +39,7 @@ def desk(
 
     \b
       dior-rt desk photo.jpg
-      dior-rt desk --no-browser --port 8642
+      dior-rt desk --no-browser --port 8700
     """
     with needs_extra("desk"):
         from dior_rt.desk.server import run_desk

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import tempfile
 import webbrowser
@@ -21,14 +22,22 @@ from dior_rt.relight import Relighter
 
 HOST: Final = "127.0.0.1"
 
+#: The port unless one is asked for. Browsers keep drawings by port, so it should be the same each time.
+USUAL_PORT: Final = 8642
+
 
 def run_desk(
-    load: Callable[[], Relighter], photo: Path | None, port: int, browse: bool, say: Callable[[str], None]
+    load: Callable[[], Relighter],
+    photo: Path | None,
+    port: int | None,
+    browse: bool,
+    say: Callable[[str], None],
 ) -> None:
     """Serve the desk on the loopback interface until Ctrl-C.
 
-    load: makes the model. photo: to begin with. port: 0 takes a free one. browse: open the page. say: gets
-    the link. Raises InputError for a port that is taken.
+    load: makes the model. photo: to begin with. port: 0 takes a free one; None takes USUAL_PORT, or a free
+    one where that is taken. browse: open the page. say: gets the link. Raises InputError for a port that is
+    taken.
     """
     token = new_token()
     with _listen(port) as listener, tempfile.TemporaryDirectory(prefix="dior-desk-") as folder:
@@ -44,11 +53,15 @@ def run_desk(
             uvicorn.Server(config).run([listener])
 
 
-def _listen(port: int) -> socket.socket:
+def _listen(port: int | None) -> socket.socket:
+    if port is None:
+        with contextlib.suppress(InputError):
+            return _listen(USUAL_PORT)
     listener = socket.socket()
     try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind((HOST, port))
+        if os.name != "nt":  # there it would let two programs share the port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((HOST, port or 0))
         return listener
     except (OSError, OverflowError) as error:
         listener.close()

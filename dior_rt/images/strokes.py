@@ -1,13 +1,18 @@
 """Strokes and Lumi maps in and out of files. docs and README call these the ways to draw light.
 
-    strokes.png    RGBA: where alpha > 0 light is specified, and the colour is that light, sRGB-encoded
-    map.png        RGB (any picture): light is specified everywhere, or with key "black" wherever it is not
-    black map.exr        float RGB, linear light; with A: A > 0 is specified, and RGB is multiplied by A, as
-    EXR has it map.npy        float (H, W, 3) linear light, or (H, W, 4) with the mask 0..1 as the fourth
-    channel strokes.json   strokes as lines: [stroke, ...] or {"size": [width, height], "strokes": [stroke,
-    ...]}
+    strokes.png     RGBA: where alpha > 0 light is specified, and the colour is that light, sRGB-encoded
 
-    project.dior        the lights of a project of the light desk: see `dior_rt.project`
+    map.png         RGB (any picture): light is specified everywhere, or with key "black" wherever it is not
+                    black
+
+    map.exr         float RGB, linear light; with A: A > 0 is specified, and RGB is multiplied by A, as EXR
+                    has it
+
+    map.npy         float (H, W, 3) linear light, or (H, W, 4) with the mask 0..1 as the fourth channel
+
+    strokes.json    strokes as lines: [stroke, ...] or {"size": [width, height], "strokes": [stroke, ...]}
+
+    project.dior    the lights of a project of the light desk: see `dior_rt.project`
 
 A stroke in JSON is {"points": [[x, y], ...], "width": pixels} and, where wanted, "color": "#rrggbb" (sRGB) or
 [r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1, "blend": "set", "add" or "multiply", see

@@ -1,4 +1,4 @@
-"""A desk that is open, and a real browser. Tests that need the browser skip with a reason where there is none."""
+"""A desk that is open, and a real browser; tests that need it skip with a reason where there is none."""
 
 from __future__ import annotations
 

@@ -212,7 +212,9 @@ def test_a_project_of_another_photo_is_refused(client, photo):
 # Results
 
 
-def test_the_export_is_the_file_that_the_command_line_writes(client, photo, photo_file, mini_bundle, tmp_path):
+def test_the_export_is_the_file_that_the_command_line_writes(
+    client, photo, photo_file, mini_bundle, tmp_path
+):
     flag = {**LIGHT, "blend": "multiply", "reach": None, "strength": 0.3}
     wanted = project(LIGHT, flag, steps=3)
     job = relit(client, photo, wanted)

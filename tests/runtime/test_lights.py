@@ -141,7 +141,9 @@ def test_an_open_photo_gives_what_relight_gives(relighter, photo):
     for drawing in (strokes, [lamp()]):
         once = relighter.relight(photo, drawing, seed=5).picture
         assert np.array_equal(opened.relight(drawing, seed=5).picture, once)
-        assert np.array_equal(opened.relight(drawing, seed=5).picture, once)  # and once more, from what is kept
+        assert np.array_equal(
+            opened.relight(drawing, seed=5).picture, once
+        )  # and once more, from what is kept
 
 
 def test_the_target_is_the_source_map_and_the_lamp(relighter, photo):
@@ -193,9 +195,7 @@ def test_json_strokes_that_blend_become_layers(tmp_path, relighter, photo):
     layers = read_strokes(path, (60, 90))
     assert [(layer.blend, len(layer.drawn)) for layer in layers] == [("add", 2), ("multiply", 1), ("set", 1)]
     relit = relighter.relight(photo, layers)
-    raster = [
-        Light(NumpyOps().draw_strokes(list(layer.drawn), (60, 90)), layer.blend) for layer in layers
-    ]
+    raster = [Light(NumpyOps().draw_strokes(list(layer.drawn), (60, 90)), layer.blend) for layer in layers]
     assert np.array_equal(relit.picture, relighter.relight(photo, raster).picture)
 
 

@@ -26,7 +26,7 @@ const PRESETS = {
   windowRight: (size) => ({ reach: null, shapes: [gradient(size, [1, 0.35], [0.25, 0.6], { color: kelvin(6000), intensity: 1.8 })] }),
   candle: (size) => ({
     reach: 0.3,
-    shapes: [glow(size, 0.5, 0.7, 0.42, 0.5, { color: kelvin(1900), intensity: 1.4 }), glow(size, 0.5, 0.74, 0.15, 0.2, { color: kelvin(2000), intensity: 4 })],
+    shapes: [glow(size, 0.5, 0.7, 0.42, 0.5, { color: kelvin(2400), intensity: 1 }), glow(size, 0.5, 0.74, 0.15, 0.2, { color: kelvin(2500), intensity: 2.5 })],
   }),
   sunset: (size) => ({ reach: null, shapes: [gradient(size, [0, 0.75], [0.9, 0.35], { color: kelvin(2600), intensity: 2.2 })] }),
   moonlight: (size) => ({

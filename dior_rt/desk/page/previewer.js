@@ -12,7 +12,7 @@ export class Previewer {
   #wish = null;
   #idle = 0;
 
-  /** show({blob, longest, milliseconds}) or show({error}); busy(whether). */
+  /** show({blob, asked, fine}) or show({error}); busy(whether). asked: when, fine: whether the pen had lifted. */
   constructor(backend, show, busy) {
     this.#backend = backend;
     this.#show = show;
@@ -52,7 +52,7 @@ export class Previewer {
       this.#wish = null;
       try {
         const blob = await this.#backend.preview(wish.photo, wish.project, wish.longest);
-        if (blob && number === this.#newest) await this.#show({ blob, longest: wish.longest, milliseconds: performance.now() - wish.asked });
+        if (blob && number === this.#newest) await this.#show({ blob, asked: wish.asked, fine: wish.longest === FINE });
       } catch (error) {
         if (number === this.#newest) this.#show({ error });
       }
