@@ -16,6 +16,7 @@ and an eraser the same without the last term.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -84,6 +85,12 @@ class Canvas:
         self._light = np.zeros((*self.size, 3), np.float32)
         self._mask = np.zeros(self.size, np.float32)
 
+    def copy(self) -> Canvas:
+        """Another canvas with the same drawing."""
+        other = copy(self)
+        other._light, other._mask = self._light.copy(), self._mask.copy()
+        return other
+
     def draw(self, shape: Shape) -> None:
         """Lay one shape over what is drawn."""
         box, coverage = _COVERAGE[shape.kind](shape, self.size, _scale(self.photo, self.size))
@@ -112,27 +119,45 @@ def draw(shapes: Sequence[Shape], photo: tuple[int, int], longest: int = CANVAS)
     return canvas.strokes()
 
 
+@dataclass
+class _Layer:
+    """A layer that a Painter keeps. settled: a canvas with its first shapes, as many as `count`."""
+
+    settled: Canvas
+    count: int
+    shapes: tuple[Shape, ...]
+    strokes: Strokes
+
+
 class Painter:
-    """Rasters of layers, kept: a layer that only grew since the last call is drawn on, not anew."""
+    """Rasters of layers, kept. Only what is new is drawn: the last shape grows while the pen moves."""
 
     def __init__(self, photo: tuple[int, int], kept: int = 32) -> None:
         self._photo, self._most = photo, kept
-        self._canvases: dict[str, tuple[tuple[Shape, ...], Canvas, Strokes]] = {}
+        self._layers: dict[str, _Layer] = {}
 
-    def draw(self, layer: str, shapes: Sequence[Shape]) -> Strokes:
+    def draw(self, name: str, shapes: Sequence[Shape]) -> Strokes:
         """The raster of a layer by its name; the same object as long as its shapes are the same."""
         shapes = tuple(shapes)
-        drawn, canvas, strokes = self._canvases.pop(layer, ((), Canvas(self._photo), None))
-        if strokes is None or shapes != drawn:
-            if shapes[: len(drawn)] != drawn:
-                drawn, canvas = (), Canvas(self._photo)
-            for shape in shapes[len(drawn) :]:
-                canvas.draw(shape)
-            strokes = canvas.strokes()
-        self._canvases[layer] = shapes, canvas, strokes
-        while len(self._canvases) > self._most:
-            del self._canvases[next(iter(self._canvases))]
-        return strokes
+        known = self._layers.pop(name, None)
+        if known is None or known.shapes != shapes:
+            known = self._drawn(shapes, known)
+        self._layers[name] = known
+        while len(self._layers) > self._most:
+            del self._layers[next(iter(self._layers))]
+        return known.strokes
+
+    def _drawn(self, shapes: tuple[Shape, ...], known: _Layer | None) -> _Layer:
+        settled, count = Canvas(self._photo), 0
+        last = max(0, len(shapes) - 1)
+        if known and known.count <= last and known.shapes[: known.count] == shapes[: known.count]:
+            settled, count = known.settled, known.count
+        for shape in shapes[count:last]:
+            settled.draw(shape)
+        canvas = settled.copy()
+        for shape in shapes[last:]:
+            canvas.draw(shape)
+        return _Layer(settled, last, shapes, canvas.strokes())
 
 
 Box = tuple[slice, slice]

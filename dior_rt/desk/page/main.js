@@ -94,9 +94,8 @@ function drawn(shape) {
   const { doc } = history;
   const known = doc.lights.some((light) => light.id === ui.state.selected);
   if (known || shape.erase) return { doc: withShape(doc, ui.state.selected, shape), selected: ui.state.selected };
-  const light = newLight({ name: nextName(doc), id: (drawn.next ??= crypto.randomUUID()) });
-  if (!stage.live) drawn.next = null;
-  return { doc: { ...doc, lights: [...doc.lights, { ...light, shapes: [shape] }] }, selected: light.id };
+  const light = newLight({ name: nextName(doc), shapes: [shape] });
+  return { doc: { ...doc, lights: [...doc.lights, light] }, selected: light.id };
 }
 
 // What is seen
