@@ -1,4 +1,7 @@
-"""The page in a real browser: what a person does with mouse, pen and keyboard, and what is seen then."""
+"""The page in a real browser: what a person does with mouse, pen and keyboard, and what is seen then.
+
+The main way through the page is always tested, the rest with -m slow.
+"""
 
 from __future__ import annotations
 
@@ -142,6 +145,7 @@ def test_undo_and_redo_take_back_strokes_and_sliders(page):
     assert np.abs(page.seen() - lit).mean() < 0.5 and page.count_lights() == 1
 
 
+@pytest.mark.slow
 def test_mute_and_solo_take_lights_out_of_the_picture(page):
     before = page.seen()
     page.draw(*STROKE)
@@ -158,6 +162,7 @@ def test_mute_and_solo_take_lights_out_of_the_picture(page):
     assert np.abs(page.seen() - window).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_a_light_is_tinted_after_it_was_drawn(page):
     page.draw(*STROKE)
     warm = page.seen()
@@ -168,6 +173,7 @@ def test_a_light_is_tinted_after_it_was_drawn(page):
     assert red < -5 and red < blue
 
 
+@pytest.mark.slow
 def test_blend_modes_set_and_multiply_can_darken(page):
     page.tab.locator("aside").get_by_label("Strength").first.fill("0.1")
     before = page.seen()
@@ -198,6 +204,7 @@ def test_a_pen_draws_with_its_pressure(page, tmp_path):
     assert shape.pressure[0] < 0.2 < 0.9 < shape.pressure[-1]
 
 
+@pytest.mark.slow
 def test_every_tool_makes_its_shape(page, tmp_path):
     ways = {
         "Lasso fill": [(0.2, 0.2), (0.5, 0.2), (0.5, 0.5), (0.2, 0.5)],
@@ -214,6 +221,7 @@ def test_every_tool_makes_its_shape(page, tmp_path):
     assert [shape.erase for shape in shapes] == [False, False, False, True, False]
 
 
+@pytest.mark.slow
 def test_shift_draws_a_straight_line(page, tmp_path):
     page.tab.keyboard.down("Shift")
     page.draw((0.2, 0.2), (0.4, 0.7), (0.8, 0.3))
@@ -222,6 +230,7 @@ def test_shift_draws_a_straight_line(page, tmp_path):
     assert np.allclose(shape.points, [(96, 64), (384, 96)], atol=2)
 
 
+@pytest.mark.slow
 def test_the_eyedropper_takes_the_photos_colour(page, photo_file, tmp_path):
     page.button("Pick a colour from the photo").click()
     page.tab.mouse.click(*page.at(0.9, 0.9))
@@ -247,6 +256,7 @@ def test_the_export_is_the_command_lines_result_of_the_saved_project(page, photo
     assert (tmp_path / "page.png").read_bytes() == out.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_full_result_takes_the_previews_place(page):
     page.draw(*STROKE)
     preview = page.seen()
@@ -269,6 +279,7 @@ def test_a_reload_loses_nothing(page, tmp_path):
     assert read_project(page.saved(tmp_path, "after.dior")) == before
 
 
+@pytest.mark.slow
 def test_two_tabs_have_drawings_of_their_own(page, profile, desk, tmp_path):
     page.draw(*STROKE)
     other = Page(profile.new_page()).open(desk.link)
@@ -283,6 +294,7 @@ def test_two_tabs_have_drawings_of_their_own(page, profile, desk, tmp_path):
     assert other.errors == []
 
 
+@pytest.mark.slow
 def test_a_project_is_opened_again_and_a_damaged_one_is_one_sentence(page, tmp_path):
     page.draw(*STROKE)
     lit, path = page.seen(), page.saved(tmp_path)
@@ -298,6 +310,7 @@ def test_a_project_is_opened_again_and_a_damaged_one_is_one_sentence(page, tmp_p
     page.errors = [error for error in page.errors if "400" not in error]  # the browser's own note
 
 
+@pytest.mark.slow
 def test_an_empty_desk_opens_a_photo_and_refuses_what_is_none(profile, empty_desk, photo_file, tmp_path):
     page = Page(profile.new_page()).open(empty_desk.link)
     assert page.tab.get_by_text("Drop a photo here").is_visible()
@@ -311,6 +324,7 @@ def test_an_empty_desk_opens_a_photo_and_refuses_what_is_none(profile, empty_des
     page.draw(*STROKE)
 
 
+@pytest.mark.slow
 def test_maps_overlays_and_the_divider_show_what_they_say(page):
     page.draw(*STROKE)
     plain = page.seen()
@@ -330,6 +344,7 @@ def test_maps_overlays_and_the_divider_show_what_they_say(page):
     assert divider.get_attribute("aria-valuenow") == "52"
 
 
+@pytest.mark.slow
 def test_snapshots_bring_a_state_back(page):
     page.draw(*STROKE)
     lit = page.seen()
@@ -345,8 +360,16 @@ def test_snapshots_bring_a_state_back(page):
     assert np.abs(page.seen() - lit).mean() < 0.5
 
 
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
+@pytest.mark.parametrize(
+    ("scheme", "size"),
+    [
+        ("dark", (1280, 800)),
+        pytest.param("light", (1280, 800), marks=pytest.mark.slow),
+        pytest.param("dark", (390, 844), marks=pytest.mark.slow),
+        pytest.param("light", (390, 844), marks=pytest.mark.slow),
+    ],
+    ids=["dark", "light", "dark phone", "light phone"],
+)
 def test_axe_finds_no_violation(page, scheme, size):
     pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is not installed")
     import axe_playwright_python
@@ -382,6 +405,7 @@ def test_the_page_fits_a_phone(page):
     assert json.loads(page.button("Glow").get_attribute("aria-pressed"))
 
 
+@pytest.mark.slow
 def test_keys_change_the_brush_and_the_view(page):
     size = page.tab.locator("aside").get_by_label("Size")
     before = float(size.input_value())

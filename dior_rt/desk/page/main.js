@@ -52,7 +52,7 @@ const overlays = segmented(t.bar.overlay, t.overlays, t.overlayHints, (value) =>
 const canvas = el('canvas', { tabIndex: 0, role: 'application', 'aria-label': t.stage });
 const divider = el('div', { class: 'divider', role: 'slider', tabIndex: 0, 'aria-label': t.split, 'aria-valuemin': '0', 'aria-valuemax': '100' });
 const legend = legendOf();
-const empty = el('div', { class: 'empty' }, icon('glow'), el('h1', {}, t.status.empty), el('button', { type: 'button', class: 'primary', onclick: () => picker.click() }, t.status.choose), el('p', {}, t.status.formats), el('p', {}, t.status.privacy));
+const empty = el('div', { class: 'empty' }, icon('glow'), el('h2', {}, t.status.empty), el('button', { type: 'button', class: 'primary', onclick: () => picker.click() }, t.status.choose), el('p', {}, t.status.formats), el('p', {}, t.status.privacy));
 const main = el('main', { class: 'stage' }, canvas, divider, legend, empty);
 
 const toolButtons = ['brush', 'eraser', 'lasso', 'gradient', 'glow', 'picker', 'hand'].map((name) =>
@@ -61,14 +61,14 @@ const toolbar = el('div', { class: 'tools', role: 'toolbar', 'aria-label': t.too
   iconButton('fit', t.bar.fit, () => stage.fit()), iconButton('rotate', t.bar.rotate, rotate), iconButton('full', t.bar.fullscreen, fullscreen), iconButton('help', t.bar.help, helpDialog), iconButton('theme', t.bar.theme, switchTheme));
 
 const header = el('header', { class: 'bar' },
-  el('div', { class: 'group' }, el('strong', { class: 'brand' }, icon('glow'), t.title), el('button', { type: 'button', title: `${t.bar.openHint} (Ctrl O)`, onclick: () => picker.click() }, t.bar.open), saveButton, picker, undoButton, redoButton),
+  el('div', { class: 'group' }, el('h1', { class: 'brand' }, icon('glow'), t.title), el('button', { type: 'button', title: `${t.bar.openHint} (Ctrl O)`, onclick: () => picker.click() }, t.bar.open), saveButton, picker, undoButton, redoButton),
   photoName,
   el('div', { class: 'group' }, views.node, overlays.node),
   el('div', { class: 'group' }, progress, relightButton, exportButton));
 const side = el('aside', { class: 'side', 'aria-label': t.lights.title });
-document.body.append(header, toolbar, main, side, el('footer', { class: 'foot' }, status, timing, zoomLabel));
+document.body.append(header, el('nav', { 'aria-label': t.tools.label }, toolbar), main, side, el('footer', { class: 'foot' }, status, timing, zoomLabel));
 
-const stage = new Stage(canvas, view, history, ui);
+const stage = new Stage(canvas, view, history, ui, refreshView);
 const tools = new Tools({
   stage, view, ui, history,
   live: (shape, tool) => {
@@ -259,7 +259,6 @@ async function show(opened, doc, said = opened.notices.join(' ')) {
   panels.snapshots.clear();
   history.reset(doc);
   stage.fit();
-  refreshView();
   ui.set({});
   updateMap();
   say(said);
@@ -367,7 +366,7 @@ bindKeys({
   soft: (step) => ui.set({ softness: clamp(ui.state.softness + step / 10, 0, 1) }),
   swap,
   zoom: zoomMiddle,
-  fit: () => history.doc && (stage.fit(), refreshView()),
+  fit: () => history.doc && stage.fit(),
   actual: () => zoomMiddle(1 / view.scale),
   rotate, fullscreen,
   view: (name) => toggled('view', name, 'relit'),

@@ -13,8 +13,9 @@ export class Stage {
   #frame = 0;
   #rasters = new LightRasters();
 
-  constructor(canvas, view, history, ui) {
-    Object.assign(this, { canvas, view, history, ui });
+  /** onview is called when the view has changed. */
+  constructor(canvas, view, history, ui, onview) {
+    Object.assign(this, { canvas, view, history, ui, onview });
     new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
   }
 
@@ -46,6 +47,7 @@ export class Stage {
     this.fitted = true;
     this.view.fit(this.history.doc.photo.size, this.box, this.box.width < 600 ? 8 : 20);
     this.refresh();
+    this.onview();
   }
 
   #draw() {

@@ -31,7 +31,7 @@ export const t = {
     clip: 'Red: too bright to show. Blue: black.',
   },
   split: 'Divider between photo and result',
-  scale: 'Light, 1 = display white on white paper',
+  scale: 'Light; 1 shows white paper as white',
   brush: {
     title: 'Brush', size: 'Size', softness: 'Softness', flow: 'Flow',
     pressure: 'Pen pressure', thins: 'Width', fades: 'Strength',
