@@ -124,7 +124,8 @@ def _add_photos(app: FastAPI, studio: Studio, first: Path | None) -> None:
     def picture(photo: str, longest: int = MOST_PREVIEW) -> Response:
         """The photo as it is, at the size of a preview."""
         size = min(max(longest, 1), MOST_PREVIEW)
-        return Response(encode_jpeg(_photo(studio, photo).open.small(size)), media_type="image/jpeg")
+        shown = _photo(studio, photo)
+        return Response(encode_jpeg(shown.open.small(size), shown.file), media_type="image/jpeg")
 
 
 def _add_light(app: FastAPI, studio: Studio) -> None:
@@ -183,8 +184,9 @@ def _add_jobs(app: FastAPI, studio: Studio) -> None:
     @app.get("/api/jobs/{job}/picture")
     def picture(job: str, longest: int = MOST_PREVIEW) -> Response:
         """The result at the size of a preview."""
-        pixels = shrink(_result(studio, job).photo, min(max(longest, 16), MOST_PREVIEW))
-        return Response(encode_jpeg(pixels), media_type="image/jpeg")
+        relit = _result(studio, job).photo
+        pixels = shrink(relit, min(max(longest, 16), MOST_PREVIEW))
+        return Response(encode_jpeg(pixels, relit), media_type="image/jpeg")
 
     @app.get("/api/jobs/{job}/file")
     def export(job: str, kind: str = "png") -> Response:

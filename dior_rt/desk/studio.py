@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +21,7 @@ from dior_rt.errors import Cancelled, InputError
 from dior_rt.images.photo import Photo, read_photo, write_photo
 from dior_rt.kernels import Strokes
 from dior_rt.lights import Light
-from dior_rt.project import Project, lights_of
+from dior_rt.project import Project, hash_file, lights_of
 from dior_rt.relight import OpenPhoto, Relighter
 
 MOST_PHOTOS: Final = 3  # that stay open; the one unused for longest is closed
@@ -98,12 +97,13 @@ class Studio:
 
     def open(self, path: Path, name: str) -> Shown:
         """Put the photo of a file on the desk. Raises InputError."""
+        digest = hash_file(path)
+        if known := self.photo(digest):
+            return replace(known, name=name)
         try:
             photo = read_photo(path)
         except InputError as error:
             raise InputError(str(error).replace(f" {path}", f" {name}")) from error
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
         shown = Shown(
             digest,
             name,
@@ -143,7 +143,7 @@ class Studio:
                 intensity=project.settings.intensity,
                 progress=lambda step, steps: is_newest(),
             )
-        return encode_jpeg(np.asarray(relit.picture)), relit.notice
+        return encode_jpeg(np.asarray(relit.picture), shown.file), relit.notice
 
     def target(self, shown: Shown, project: Project) -> Strokes:
         """What the lights ask for, on the light grid."""
@@ -177,10 +177,12 @@ class Studio:
             path.unlink(missing_ok=True)
 
 
-def encode_jpeg(pixels: NDArray) -> bytes:
-    """A picture for the page."""
+def encode_jpeg(pixels: NDArray, photo: Photo) -> bytes:
+    """A picture for the page, with the profile of the photo that it shows."""
+    # A profile with another curve than sRGB's would not fit these pixels.
+    profile = {} if photo.curves else {"icc_profile": photo.icc}
     file = io.BytesIO()
-    Image.fromarray(pixels).save(file, "JPEG", quality=QUALITY, subsampling=0)
+    Image.fromarray(pixels).save(file, "JPEG", quality=QUALITY, subsampling=0, **profile)
     return file.getvalue()
 
 

@@ -126,6 +126,19 @@ def test_a_photo_is_opened_by_its_bytes(client, photo_file, photo, desk):
     assert list(desk.folder.iterdir()) == []  # the upload is gone
 
 
+def test_a_photo_with_a_profile_is_shown_with_it(client, photo_file):
+    """Display P3 has sRGB's curve, so a preview's pixels and the profile belong together."""
+    from PIL import ImageCms
+
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    file = io.BytesIO()
+    with Image.open(photo_file) as picture:
+        picture.save(file, "PNG", icc_profile=profile)
+    opened = client.post("api/photos?name=p3.png", content=file.getvalue()).json()
+    shown = Image.open(io.BytesIO(client.get(f"api/photos/{opened['id']}/picture").content))
+    assert shown.info.get("icc_profile") == profile
+
+
 @pytest.mark.parametrize("data", [b"", b"no picture", b"\x89PNG\r\n\x1a\n" + bytes(50)])
 def test_a_corrupt_photo_is_one_sentence_and_leaves_nothing(client, desk, data):
     answer = client.post("api/photos?name=broken.png", content=data)

@@ -436,12 +436,12 @@ async function start() {
 }
 
 /** Take up what was drawn before: the photo is still open, or in the browser, or the command line's. */
-async function resume(kept, first) {
-  let opened = kept.id === first?.id ? first : await backend.find(kept.id);
-  if (!opened && kept.photo) opened = await backend.open(kept.photo, kept.name);
-  if (!opened) return say(t.status.reopen(kept.name), true);
-  await show(opened, kept.doc, t.status.restored);
-  ui.set({ ...kept.ui, tool: kept.ui.tool });
+async function resume({ record, photo: kept }, first) {
+  let opened = record.id === first?.id ? first : await backend.find(record.id);
+  if (!opened && kept) opened = await backend.open(kept, record.name);
+  if (!opened) return say(t.status.reopen(record.name), true);
+  await show(opened, record.doc, t.status.restored);
+  ui.set(record.ui);
 }
 
 start().catch((error) => {
