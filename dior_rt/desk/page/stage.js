@@ -97,8 +97,10 @@ export class Stage {
     for (const light of doc.lights) {
       if (!light.on || (solo && !light.solo)) continue;
       ctx.globalAlpha = light.id === this.ui.state.selected ? 0.85 : 0.5;
+      ctx.globalCompositeOperation = light.blend === 'multiply' ? 'multiply' : 'source-over';
       ctx.drawImage(this.#rasters.of(light, doc.photo.size), 0, 0, width, height);
     }
+    ctx.globalCompositeOperation = 'source-over';
     ctx.globalAlpha = 1;
   }
 
