@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -48,6 +48,7 @@ def test_half_coverage_goes_half_the_way(blend):
 
 
 @pytest.mark.parametrize("blend", ["set", "add", "multiply"])
+@settings(deadline=None)
 @given(strength=st.floats(0, 16), coverage=st.floats(LEAST_COVERAGE + 1e-3, 1))
 def test_every_blend_is_linear_in_the_strength(blend, strength, coverage):
     def light(s):
@@ -56,6 +57,7 @@ def test_every_blend_is_linear_in_the_strength(blend, strength, coverage):
     assert np.allclose(light(strength) - light(0), strength * (light(1) - light(0)), rtol=1e-4, atol=1e-5)
 
 
+@settings(deadline=None)
 @given(value=st.lists(st.floats(0, 16), min_size=3, max_size=3), coverage=st.floats(0, 1))
 def test_adding_a_lamp_never_darkens(value, coverage):
     assert (composed(Light(drawn(value, coverage), "add")).target.light >= source()).all()
