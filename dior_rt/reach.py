@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dior_rt.errors import InputError
 from dior_rt.flow.sampler import Array
-from dior_rt.kernels.transfer import EPSILON
+from dior_rt.light import apply_log_ratio, log_ratio
 
 LEAST: Final = 1e-3  # of the picture's longer side: finer than any light grid
 
@@ -22,18 +22,16 @@ def check_reach(reach: float | None) -> None:
 
 
 def within_reach(source: Array, relit: Array, mask: Array, reach: float) -> Array:
-    """Fade from `relit` where the mask (h, w) is above 0 to `source` beyond the reach."""
+    """Return `relit` where the mask (h, w) is above 0, fading to `source` beyond the reach."""
     return fade(source, relit, closeness(mask > 0, reach))
 
 
 def fade(source: Array, relit: Array, nearness: Array) -> Array:
-    """(relit + e) / (source + e) to the power of `nearness`, times source + e, less e: e as in `transfer`.
+    """Return the relit light with its log-ratio to the source scaled by `nearness`.
 
     source, relit: (h, w, 3) linear light; nearness: (h, w), 1 is all of `relit` and 0 all of `source`.
     """
-    e = np.float32(EPSILON)
-    ratio = np.log((relit + e) / (source + e)) * nearness[..., None]
-    return np.maximum((source + e) * np.exp(ratio) - e, 0)  # black comes back as a rounding error
+    return apply_log_ratio(source, log_ratio(relit, source) * nearness[..., None])
 
 
 def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeGuard, cast
+from typing import Any, TypeGuard, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +19,17 @@ from PIL import Image
 from dior_rt import __version__
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
-from dior_rt.families import Family
-from dior_rt.families.mini import Mini
-from dior_rt.families.qwen.frame import shrink
-from dior_rt.families.qwen.model import Qwen
+from dior_rt.families import open_family
 from dior_rt.flow.adaptive import sample_within
 from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.images.arrays import Picture, check_same_shape, like_photo, read_pixels, read_strokes
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
-from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.light import decode_small
 from dior_rt.lights import Composed, Cover, Light, compose, cover
-from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
+from dior_rt.presets import ALWAYS, REFERENCE, read_presets
 from dior_rt.reach import check_reach, closeness, fade
+from dior_rt.sampling import DEFAULTS, Sampling, SamplingFields, SamplingOptions, resolve_sampling
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
@@ -106,13 +104,18 @@ class Relighter:
         threads: CPU threads for the network. Raises BundleError, and DeviceError for a device that is not
         there or computes wrong results.
         """
-        self.bundle = read_bundle(Path(bundle) if bundle else default_bundle())
+        self._bundle = read_bundle(Path(bundle) if bundle else default_bundle())
         with ThreadPoolExecutor(1) as pool:  # a cold device compiles its kernels while the network loads
             opening = pool.submit(open_ops, ops)
             self._family = open_family(self.bundle, device, threads)
             with _device_errors():
                 self._ops = opening.result()
         self.device, self.device_reason = self._family.device, self._family.reason
+
+    @property
+    def bundle(self) -> Bundle:
+        """The bundle that was loaded."""
+        return self._bundle
 
     @property
     def ops(self) -> str:
@@ -149,81 +152,68 @@ class Relighter:
         self,
         photo: Picture,
         strokes: Drawing,
+        options: SamplingOptions = DEFAULTS,
         *,
-        preset: str | None = None,
-        steps: int | None = None,
-        solver: str | None = None,
-        shift: float | None = None,
-        guidance: float | None = None,
-        interval: tuple[float, float] | None = None,
-        tolerance: float | None = None,
         seed: int = 0,
         intensity: float = 1.0,
         reach: float | None = None,
         progress: Progress | None = None,
+        **fields: Unpack[SamplingFields],
     ) -> Relit:
-        """The photo under the light of the strokes.
+        """Return the photo under the light of the strokes.
 
         photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
-        strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
-        sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
-        Stroke, in pixels of the photo; or a list of Light, which `dior_rt.lights` composes with the light on
-        the photo.
-        preset: "reference" or a faster one of the model's own, such as "fast"; see `Relighter.presets`.
-        steps, solver, shift, guidance, interval, tolerance: each goes over the preset's where it is not None;
-        see `Sampling`. intensity: multiplies the drawn light, >= 0. reach: how far from the strokes light
-        changes, in longer sides of the photo, see `within_reach`; None: as far as the model takes it, or as
-        each Light says.
-        progress: called after each step with (step, steps), of which it passes several at a time where the
-        solver chooses its own; returning False stops with Cancelled.
+        strokes: one of
+          - Strokes, or RGBA as a Pillow image or an array (H, W, 4), shaped like the photo or like its light
+            grid, of any size; alpha 0 = unspecified, integers are sRGB-encoded and floats linear;
+          - a list of Stroke, in pixels of the photo;
+          - a list of Light, which `dior_rt.lights` composes with the light on the photo.
+        options: how the flow is sampled. The fields of SamplingOptions may also be given as keywords, such
+          as preset="fast" or steps=4; a keyword takes precedence.
+        seed: of the starting noise.
+        intensity: multiplies the light of the strokes, >= 0.
+        reach: how far from the strokes light changes, in longer sides of the photo, see `within_reach`;
+          None leaves it to the model, or to each Light.
+        progress: called after each step with (step, steps); it may skip steps where the solver chooses its
+          own. Returning False stops with Cancelled.
 
         Raises InputError for what cannot be used, and DeviceError where a device fails.
         """
-        return self.open(photo).relight(
-            strokes,
-            preset=preset,
-            steps=steps,
-            solver=solver,
-            shift=shift,
-            guidance=guidance,
-            interval=interval,
-            tolerance=tolerance,
-            seed=seed,
-            intensity=intensity,
-            reach=reach,
-            progress=progress,
+        opened = self.open(photo)
+        return opened.relight(
+            strokes, options, seed=seed, intensity=intensity, reach=reach, progress=progress, **fields
         )
 
     @_device_errors()
     def estimate(
-        self, photo: Picture, *, steps: int | None = None, seed: int = 0, progress: Progress | None = None
+        self,
+        photo: Picture,
+        options: SamplingOptions = DEFAULTS,
+        *,
+        seed: int = 0,
+        progress: Progress | None = None,
+        **fields: Unpack[SamplingFields],
     ) -> Array:
-        """The photo's own light: a dense Lumi map (h, w, 3), linear float32 >= 0, of its light grid.
+        """Return the photo's source Lumi map (h, w, 3) on its light grid, linear float32 >= 0.
 
-        Arguments and errors are those of `relight`.
+        Arguments and errors are those of `relight`; guidance is 1, because there are no strokes.
         """
-        how = sampling(self.bundle, steps=steps, guidance=1.0)
+        how = resolve_sampling(self.bundle, replace(options.override(**fields), guidance=1.0))
         _check_seed(seed)
         pixels = read_pixels(photo)
-        _, encoded = self._reduce_photo(pixels, self._family.raster(*pixels.shape[:2]))
+        raster = self._family.raster(*pixels.shape[:2])
+        _, encoded = self._family.reduce_photo(pixels, raster, self._ops)
         return self._estimate(encoded, how, seed, progress)
 
     def _fast(self, **asked: Any) -> Sampling:
-        """The model's fast preset, or the reference where it has none."""
-        return sampling(self.bundle, "fast" if "fast" in self.presets else None, **asked)
+        """Return the sampling of the fast preset, or of the reference where the model has none."""
+        preset = "fast" if "fast" in self.presets else None
+        return resolve_sampling(self.bundle, SamplingOptions(preset=preset, **asked))
 
     def _estimate(self, encoded: Array, how: Sampling, seed: int, progress: Progress | None) -> Array:
         condition = self._family.encode(encoded, None, "estimate")
         x0, _ = self._sample(condition, how, seed, progress)
         return self._family.decode_lumi(x0, condition)
-
-    def _reduce_photo(self, pixels: NDArray, raster: tuple[int, int]) -> tuple[Array, Array]:
-        """The photo on its raster, linear and sRGB-encoded 0..1."""
-        if self.bundle.manifest.grid is None:  # what paints whole pictures has learnt from such as these
-            seen = shrink(pixels, raster)
-            return _linear(seen), seen
-        source = self._ops.reduce_photo(pixels, raster)
-        return source, np.clip(linear_to_srgb(source), 0, 1).astype(np.float32)
 
     def _reduce_strokes(
         self,
@@ -264,7 +254,7 @@ class Relighter:
     ) -> tuple[Array, int]:
         """The state at the end of the flow, and how many steps led there."""
         noise = draw_noise(seed, self._family.noise_shape(condition))
-        noise *= np.float32(self.bundle.manifest.noise_scale)
+        noise *= np.float32(how.noise_scale)
         taken = 0
         for state in self._states(condition, how, noise):
             taken += 1
@@ -322,30 +312,16 @@ class OpenPhoto:
     def relight(
         self,
         lights: Drawing,
+        options: SamplingOptions = DEFAULTS,
         *,
-        preset: str | None = None,
-        steps: int | None = None,
-        solver: str | None = None,
-        shift: float | None = None,
-        guidance: float | None = None,
-        interval: tuple[float, float] | None = None,
-        tolerance: float | None = None,
         seed: int = 0,
         intensity: float = 1.0,
         reach: float | None = None,
         progress: Progress | None = None,
+        **fields: Unpack[SamplingFields],
     ) -> Relit:
-        """The photo under the lights, at its full size: `Relighter.relight` says what each argument means."""
-        how = sampling(
-            self._relighter.bundle,
-            preset,
-            steps=steps,
-            solver=solver,
-            shift=shift,
-            guidance=guidance,
-            interval=interval,
-            tolerance=tolerance,
-        )
+        """Return the photo under the lights, at full size: `Relighter.relight` explains each argument."""
+        how = resolve_sampling(self._relighter.bundle, options.override(**fields))
         return self._relight(self._pixels, self.photo, lights, how, seed, intensity, reach, progress)
 
     @_device_errors()
@@ -395,7 +371,8 @@ class OpenPhoto:
 
     @cached_property
     def _reduced(self) -> tuple[Array, Array]:
-        return self._relighter._reduce_photo(self._pixels, self._raster)
+        relighter = self._relighter
+        return relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
 
     @cached_property
     def _source_map(self) -> Array:
@@ -427,7 +404,7 @@ class OpenPhoto:
         condition = relighter._family.encode(encoded, composed.target, "relight")
         x0, taken = relighter._sample(condition, how, seed, progress)
         watch.lap("steps")
-        relit = _linear(relighter._family.decode_relit(x0, condition))
+        relit = decode_small(relighter._family.decode_relit(x0, condition))
         if composed.nearness is not None:
             relit = fade(source, relit, composed.nearness)
         picture = like_photo(relighter._ops.transfer(pixels, source, relit), like)
@@ -484,18 +461,6 @@ def _are_layers(lights: Drawing) -> TypeGuard[Sequence[Light]]:
     if any(layers) and not all(layers):
         raise InputError("Give either strokes or lights, not both in one list.")
     return any(layers)
-
-
-def _linear(encoded: Array) -> Array:
-    """A small picture in linear light, without a device's help: that would have to compile for it."""
-    return srgb_to_linear(encoded).astype(np.float32)
-
-
-def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:
-    """Load a bundle's networks; raises what its family raises."""
-    if bundle.manifest.family == "mini":
-        return Mini(bundle, device, threads)
-    return Qwen(bundle, device, threads)
 
 
 def _check_intensity(intensity: float) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.onnx import ops
 
-from dior_rt.training.network import LARGEST_LOGIT, Block, Features, Mini, Turns
+from dior_rt.training.network import LARGEST_LOGIT, Block, Features, Mini, Rotation
 
 OPSET: Final = 23
 TINIEST: Final = 1e-24  # a vector of zeros stays one
@@ -90,13 +90,13 @@ class FusedBlock(Block):
         self.register_buffer("of_k", torch.full((size,), 1 / math.sqrt(size)))
         self.proj = _linear(block.proj.weight, block.proj.bias + block.proj.weight @ bias)
 
-    def _attend(self, tokens: Tensor, turns: Turns) -> Tensor:
+    def _attend(self, tokens: Tensor, turns: Rotation) -> Tensor:
         q, k = self._turned(self.q(tokens), self.of_q, turns), self._turned(self.k(tokens), self.of_k, turns)
         q, k, v = (part.unflatten(2, (self.heads, -1)) for part in (q, k, self.v(tokens)))  # (B, N, H, d)
         mixed = (q.transpose(1, 2) @ k.permute(0, 2, 3, 1)).softmax(dim=-1) @ v.transpose(1, 2)
         return self.proj(mixed.transpose(1, 2).flatten(2))
 
-    def _turned(self, part: Tensor, weight: Tensor, turns: Turns) -> Tensor:
+    def _turned(self, part: Tensor, weight: Tensor, turns: Rotation) -> Tensor:
         """Every head's vectors at the same length, turned; (B, N, width)."""
         heads = F.rms_norm(part.unflatten(2, (self.heads, -1)), weight.shape, weight, eps=TINIEST)
         return ops.rotary_embedding(heads.flatten(2), *turns, num_heads=self.heads)

@@ -52,7 +52,7 @@ LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothin
 
 
 @dataclass(frozen=True)
-class Recipe:
+class MiniExportConfig:
     """How a network wants to be run; the fields are the manifest's."""
 
     name: str = "mini"
@@ -63,7 +63,7 @@ class Recipe:
     noise_scale: float = 1.0
 
 
-USUAL: Final = Recipe()
+USUAL: Final = MiniExportConfig()
 
 
 def export_checkpoint(
@@ -71,37 +71,37 @@ def export_checkpoint(
     out: Path,
     *,
     lora: Path | None = None,
-    recipe: Recipe = USUAL,
+    config: MiniExportConfig = USUAL,
     weights: Weights = "fp16",
     overwrite: bool = False,
 ) -> Bundle:
     """Write the bundle of a checkpoint at `out`.
 
     checkpoint: a folder that training wrote, or its model.safetensors. lora: a folder of peft's to be
-    merged; of a checkpoint's folder it is lora/, where there is one. recipe: its grid's multiple is set to
+    merged; of a checkpoint's folder it is lora/, where there is one. config: its grid's multiple is set to
     the network's patch. Raises InputError for files that cannot be used, and what `export_network` raises.
     """
     check_target(out, overwrite)
     if checkpoint.is_dir():
         checkpoint, lora = checkpoint / WEIGHTS, lora or _present(checkpoint / LORA)
     network = load_network(checkpoint)
-    recipe = replace(recipe, grid=replace(recipe.grid, multiple=network.config.patch))
+    config = replace(config, grid=replace(config.grid, multiple=network.config.patch))
     merged = merge_lora(network, lora) if lora else network
-    return export_network(merged, recipe, out, weights=weights, overwrite=overwrite)
+    return export_network(merged, config, out, weights=weights, overwrite=overwrite)
 
 
 def export_network(
-    network: Mini, recipe: Recipe, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
+    network: Mini, config: MiniExportConfig, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
 ) -> Bundle:
     """Write a network's bundle at `out`.
 
     weights: how they are stored; but for fp32 the network's own are rounded to float16 in place. The graphs
-    compute in float32, but for int8 with the matrix products in integers. Raises InputError for a recipe that
+    compute in float32, but for int8 with the matrix products in integers. Raises InputError for a config that
     cannot be, ExportError where they compute something else than torch with the same weights, beyond
     `BARS`, and BundleError where nothing can be written.
     """
     check_target(out, overwrite)
-    manifest, grid = describe(recipe, weights), recipe.grid
+    manifest, grid = describe(config, weights), config.grid
     network = network.eval()
     parity = {} if weights == "fp32" else {"weights_as_fp16": round_to_half(network, grid)}
     with tempfile.TemporaryDirectory() as scratch:
@@ -111,9 +111,9 @@ def export_network(
             files |= write_graph(part, name, Path(scratch), grid.multiple, weights)
         engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
         found = mini.Graphs(**engines)
-        bars, sigmas = BARS[weights], recipe.schedule.sigmas(recipe.steps)
+        bars, sigmas = BARS[weights], config.schedule.sigmas(config.steps)
         parity["evaluation"] = check_evaluations(network, found, grid, bars)
-        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, recipe.guidance, bars)
+        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, config.guidance, bars)
         graphs = {
             name: Graph(f"{name}.onnx", engine.inputs, engine.outputs, f"{name}.npz")
             for name, engine in engines.items()
@@ -299,24 +299,22 @@ def open_checked(graph: Path) -> Engine:
     return Engine(graph)
 
 
-def describe(recipe: Recipe, weights: Weights) -> Manifest:
-    """The manifest of an export, before its graph is made. Raises InputError for a recipe that cannot be."""
+def describe(config: MiniExportConfig, weights: Weights) -> Manifest:
+    """The manifest of an export, before its graph is made. Raises InputError for a config that cannot be."""
     try:
         return Manifest(
             family="mini",
-            name=recipe.name,
+            name=config.name,
             licence="Apache-2.0",
             precision=weights,
             files={},
             graphs={},
-            schedule=recipe.schedule,
-            steps=recipe.steps,
-            guidance=recipe.guidance,
-            colour="srgb",
-            grid=recipe.grid,
-            noise_scale=recipe.noise_scale,
+            schedule=config.schedule,
+            steps=config.steps,
+            guidance=config.guidance,
+            grid=config.grid,
+            noise_scale=config.noise_scale,
             parity={},
-            settings={},
         )
     except ValueError as error:
         raise InputError(f"The model cannot be run so: {reason(error)}.") from error

@@ -6,26 +6,14 @@ import atexit
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dior_rt.kernels.guard import GuardedOps
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
 from dior_rt.kernels.selftest import self_test
-from dior_rt.kernels.tested import TestedOps
-from dior_rt.kernels.types import KernelError
-
-
-@dataclass(frozen=True)
-class Device:
-    """An OpenCL device. index: its place in `list_devices()`; type: "gpu", "cpu", "accelerator", "other"."""
-
-    index: int
-    name: str
-    platform: str
-    type: str
-    handle: Any
+from dior_rt.kernels.types import Device, KernelError
 
 
 def list_devices() -> list[Device]:
@@ -93,13 +81,13 @@ def open_ops(name: str = "auto") -> Ops:
     return open_device(devices[0])
 
 
-def open_device(device: Device, spare: Ops | None = None) -> TestedOps:
+def open_device(device: Device, spare: Ops | None = None) -> GuardedOps:
     """The Ops of one device. An operation is tried before its first use; where it fails, `spare` takes over.
 
     Raises KernelError if the device cannot be opened, or fails what every 8-bit photo needs first."""
     from dior_rt.kernels.opencl_ops import OpenCLOps
 
-    return TestedOps(OpenCLOps(device), spare)
+    return GuardedOps(OpenCLOps(device), spare)
 
 
 def check_device(device: Device) -> None:

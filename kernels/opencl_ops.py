@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
@@ -15,10 +13,7 @@ from dior_rt.kernels.resample import FAINTEST, bands, spline_taps
 from dior_rt.kernels.session import Session
 from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, SIGMA
-from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
-
-if TYPE_CHECKING:
-    from dior_rt.kernels.devices import Device
+from dior_rt.kernels.types import Device, FloatArray, Picture, Stroke, Strokes
 
 #: How a sample's dtype is called in OpenCL C.
 SAMPLES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}

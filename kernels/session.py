@@ -7,15 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import pyopencl as cl
 
-from dior_rt.kernels.types import KernelError
-
-if TYPE_CHECKING:
-    from dior_rt.kernels.devices import Device
+from dior_rt.kernels.types import Device, KernelError
 
 FOLDER = Path(__file__).parent
 SOURCES = ("curve.cl", "reduce.cl", "transfer.cl", "draw.cl", "sparsify.cl")

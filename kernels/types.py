@@ -21,6 +21,17 @@ class KernelError(ValueError):
 
 
 @dataclass(frozen=True)
+class Device:
+    """An OpenCL device. index: its place in `list_devices()`; type: "gpu", "cpu", "accelerator", "other"."""
+
+    index: int
+    name: str
+    platform: str
+    type: str
+    handle: Any
+
+
+@dataclass(frozen=True)
 class Stroke:
     """One pull of the brush: a polyline with round caps; a single point is a dot.
 

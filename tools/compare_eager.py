@@ -24,6 +24,7 @@ from dior_rt.export.lora import merge_lora
 from dior_rt.families.mini import Mini, null
 from dior_rt.flow.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 from dior_rt.training.network import LORA, WEIGHTS, load_network
+from tools.command import start
 
 CHECKPOINT = Path(__file__).parents[1] / "training/checkpoints/mini"
 
@@ -81,4 +82,4 @@ def eager() -> Callable[[Condition], Velocity]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    start(main)

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from dior_rt.cli.extras import needs_extra
 from dior_rt.errors import InputError
+from dior_rt.extras import needs_extra
 
 app = typer.Typer(no_args_is_help=True, help="Render scenes and train the network (needs dior-rt[train]).")
 

@@ -22,22 +22,15 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder
+from dior_rt.flow.schedule import shift_sigma
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.data.triplets import GRIDS, Batches, Grids, load_views
-from dior_rt.training.network import (
-    BOUNCED,
-    FLOOR,
-    RELIT_SCALE,
-    WEIGHTS,
-    Config,
-    Mini,
-    load_network,
-    save_network,
-    srgb_to_linear,
-)
+from dior_rt.training.light import FLOOR, RELIT_SCALE, log_floored, srgb_to_linear
+from dior_rt.training.network import BOUNCED, WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.state import Average, State
 
 STOPS: Final = 2.0  # by which drawn light is strengthened or dimmed to see what it does
+LEAST_SIGMA: Final = 0.02  # smallest flow time that is drawn
 STATE: Final = "state.safetensors"  # what a run resumes from
 
 Progress = Callable[[int, float], None]  # step, running loss
@@ -173,7 +166,7 @@ def response_loss(network: nn.Module, batch: Batch, factor: Tensor) -> Tensor:
     times = factor[:, None, None, None]
 
     def lit(velocity: Tensor) -> Tensor:
-        return torch.log(srgb_to_linear(photo - velocity.float() / RELIT_SCALE) + FLOOR)
+        return log_floored(srgb_to_linear(photo - velocity.float() / RELIT_SCALE))
 
     silent = {"x": x, "sigma": sigma, "photo": photo, "mask": mask, "mode": mode}
     with torch.no_grad():
@@ -193,7 +186,7 @@ def _mean_square(error: Tensor) -> Tensor:
 def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
     """(count,) flow times: 1 for a share of the samples, else u -> s u / (1 + (s - 1) u) of a uniform u."""
     u = torch.rand(count, generator=generator)
-    shifted = (plan.shift * u / (1 + (plan.shift - 1) * u)).clamp_min(0.02)
+    shifted = shift_sigma(u, plan.shift).clamp_min(LEAST_SIGMA)
     return torch.where(torch.rand(count, generator=generator) < plan.always_noise, torch.ones(count), shifted)
 
 

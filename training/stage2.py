@@ -33,7 +33,7 @@ from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
 from dior_rt.training.backbone import Backbone
 from dior_rt.training.fit import Batch, Plan, Progress, rendered, run
-from dior_rt.training.network import RELIT_SCALE, linear_to_srgb
+from dior_rt.training.light import RELIT_SCALE, linear_to_srgb
 
 OPS: Final = NumpyOps()
 SPARSITIES: Final = get_args(Sparsity)

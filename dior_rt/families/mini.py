@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dior_rt.bundle import Bundle
 from dior_rt.engine import Engine, open_engine
@@ -17,11 +18,11 @@ from dior_rt.errors import BundleError
 from dior_rt.families import Mode
 from dior_rt.flow.sampler import Array, Condition, Velocity, guided
 from dior_rt.flow.schedule import ShiftSchedule
-from dior_rt.kernels import Strokes
+from dior_rt.kernels import Ops, Strokes
+from dior_rt.kernels.color import linear_to_srgb
+from dior_rt.light import lumi_from_x0, relit_from_x0
 
 MODES: Final[dict[Mode, int]] = {"relight": 0, "estimate": 1}
-RELIT_SCALE: Final = np.float32(4)
-LUMI_SCALE: Final = np.float32(8)
 SEEN: Final = ("photo", "light", "mask")  # of a condition, what the graph "encode" looks at
 
 
@@ -43,6 +44,10 @@ class Mini:
     def raster(self, height: int, width: int) -> tuple[int, int]:
         return self._grid.shape(height, width)
 
+    def reduce_photo(self, pixels: NDArray, raster: tuple[int, int], ops: Ops) -> tuple[Array, Array]:
+        linear = ops.reduce_photo(pixels, raster)
+        return linear, np.clip(linear_to_srgb(linear), 0, 1).astype(np.float32)
+
     def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
         return encode(photo, strokes, mode)
 
@@ -56,11 +61,10 @@ class Mini:
         return self._graphs.guided(condition, guidance)
 
     def decode_relit(self, x0: Array, condition: Condition) -> Array:
-        return _pixels(np.clip(condition["photo"] + x0 / RELIT_SCALE, 0, 1))
+        return _pixels(relit_from_x0(x0, condition["photo"]))
 
     def decode_lumi(self, x0: Array, condition: Condition) -> Array:
-        encoded = np.maximum((_pixels(x0) + 1) / 2, 0)
-        return np.expm1(encoded * np.log1p(LUMI_SCALE)) / LUMI_SCALE
+        return lumi_from_x0(_pixels(x0))
 
 
 def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:

@@ -222,7 +222,10 @@ def relight_file(loaded, case: Case, folder: Path) -> np.ndarray:
     return samples_of(made)
 
 
-@pytest.mark.parametrize("kind", [*CONTENTS, *KINDS])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.slow] if "4000" in kind else []) for kind in (*CONTENTS, *KINDS)],
+)
 def test_every_kind_of_photo(relighter, ops, expected, hold, tmp_path, kind):
     case, name = {**CONTENTS, **KINDS}[kind], ops.name.split()[0]
     got = relight_file(relighter("fp32", name), case, tmp_path)

@@ -12,19 +12,8 @@ from dior_rt.errors import InputError
 from dior_rt.export.lora import merge_lora
 from dior_rt.training.data.triplets import Batches
 from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss, response_loss
-from dior_rt.training.network import (
-    BOUNCED,
-    FLOOR,
-    LORA,
-    RELIT_SCALE,
-    WEIGHTS,
-    Config,
-    Mini,
-    linear_to_srgb,
-    load_network,
-    save_network,
-    srgb_to_linear,
-)
+from dior_rt.training.light import FLOOR, RELIT_SCALE, linear_to_srgb, srgb_to_linear
+from dior_rt.training.network import BOUNCED, LORA, WEIGHTS, Config, Mini, load_network, save_network
 
 TINY = Config(width=32, depth=1, heads=2, patch=8, fine=4, half=8, quarter=16)
 SHORT = Plan(steps=6, batch=2, rate=2e-3, warmup=2, average=2, save_every=2)

@@ -16,16 +16,8 @@ from dior_rt.export.lora import merge_lora
 from dior_rt.kernels import NumpyOps
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.fit import STATE, Plan, fit, flow_loss, rendered
-from dior_rt.training.network import (
-    LORA,
-    RELIT_SCALE,
-    WEIGHTS,
-    Config,
-    decode_light,
-    encode_light,
-    load_network,
-    srgb_to_linear,
-)
+from dior_rt.training.light import RELIT_SCALE, decode_lumi, encode_lumi, srgb_to_linear
+from dior_rt.training.network import LORA, WEIGHTS, Config, load_network
 from dior_rt.training.stage2 import (
     MixedBatches,
     Mixture,
@@ -81,7 +73,7 @@ class Oracle:
 
     class Flow(torch.nn.Module):
         def forward(self, x, sigma, photo, light, mask, mode):
-            x0 = 2 * encode_light(2 * srgb_to_linear(photo)) - 1
+            x0 = 2 * encode_lumi(2 * srgb_to_linear(photo)) - 1
             return (x - x0) / sigma[:, None, None, None]
 
     network = Flow()
@@ -90,7 +82,7 @@ class Oracle:
         return batch
 
     def lumi(self, x0, grid):
-        return decode_light((x0 + 1) / 2)
+        return decode_lumi((x0 + 1) / 2)
 
     def save(self, network):
         raise NotImplementedError

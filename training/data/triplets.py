@@ -26,9 +26,10 @@ from dior_rt.families import Mode
 from dior_rt.families.mini import MODES
 from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
+from dior_rt.light import log_ratio
 from dior_rt.training.data.camera import Camera, random_camera, white_balance
 from dior_rt.training.data.render import View
-from dior_rt.training.network import RELIT_SCALE, encode_light
+from dior_rt.training.light import RELIT_SCALE, encode_lumi
 from dior_rt.training.scenes.textures import rainbow
 
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
@@ -207,7 +208,7 @@ def zoomed(sample: Pair, grid: tuple[int, int], mirror: bool = False) -> Pair:
 
 def interest(sample: Pair) -> Raster:
     """(h, w) where a person would draw: where the light changes most."""
-    change = np.abs(np.log((sample.target + 0.02) / (sample.source + 0.02))).max(axis=2)
+    change = np.abs(log_ratio(sample.target, sample.source)).max(axis=2)
     return (change**2 + 1e-6).astype(np.float32)
 
 
@@ -328,7 +329,7 @@ def example(
         return torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1).contiguous()
 
     light, mask = strokes or (np.zeros_like(sample.photo), np.zeros(sample.photo.shape[:2], np.float32))
-    own = 2 * encode_light(planes(sample.source)) - 1
+    own = 2 * encode_lumi(planes(sample.source)) - 1
     return {
         "photo": planes(shots.photo),
         "light": planes(light),

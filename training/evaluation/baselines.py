@@ -6,10 +6,11 @@ from typing import Final
 
 import numpy as np
 
+from dior_rt.light import FLOOR
 from dior_rt.training.evaluation.metrics import Photo, Raster
 from dior_rt.training.evaluation.tasks import OPS
 
-E: Final = np.float32(0.02)  # of display white; what the quotient trusts no darkness below
+E: Final = np.float32(FLOOR)
 
 
 def gain(source: Photo, truth: Photo) -> Photo:

@@ -27,6 +27,7 @@ from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.grid import GridRule
 from dior_rt.kernels import Strokes
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.light import relit_from_x0
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.data.maps import LUMI
 from dior_rt.training.data.photos import take_photos
@@ -171,7 +172,7 @@ class Network:
 
         noise = np.float32(self.walk.noise) * draw_noise(self.walk.seed, condition["photo"].shape)
         *_, end = sample(velocity, noise, SCHEDULE.sigmas(self.walk.steps))
-        relit = np.clip(condition["photo"] + end.x / mini.RELIT_SCALE, 0, 1)[0].transpose(1, 2, 0)
+        relit = relit_from_x0(end.x, condition["photo"])[0].transpose(1, 2, 0)
         return source, srgb_to_linear(np.ascontiguousarray(relit)).astype(np.float32)
 
 

@@ -20,15 +20,16 @@ from PIL import Image
 from dior_rt.bundle import Bundle
 from dior_rt.errors import BundleError, InputError
 from dior_rt.families import Mode
-from dior_rt.families.qwen.frame import Frame, fit_content, resize
+from dior_rt.families.qwen.frame import Frame, fit_content, resize, shrink
 from dior_rt.families.qwen.layers import Layers
 from dior_rt.families.qwen.prompt import Features, PromptEncoder
 from dior_rt.families.qwen.rope import joint_places, turns
-from dior_rt.families.qwen.settings import LUMI_SCALE, MODULATION, PROMPTS, read_settings
+from dior_rt.families.qwen.settings import MODULATION, PROMPTS, read_settings
 from dior_rt.families.qwen.vae import decode_tiled, encode_tiled
 from dior_rt.flow.sampler import Array, Velocity, guide
 from dior_rt.flow.schedule import DynamicShiftSchedule
-from dior_rt.kernels import Strokes
+from dior_rt.kernels import Ops, Strokes
+from dior_rt.light import decode_small, draw_lumi, pack_patches, undraw_lumi, unpack_patches
 
 NEGATIVE: Final[dict[Mode, str]] = {"relight": "relight_negative", "estimate": "estimate_negative"}
 SAME_SIGMA: Final = 1e-6
@@ -81,6 +82,10 @@ class Qwen:
     def raster(self, height: int, width: int) -> tuple[int, int]:
         content = fit_content(self.area, height, width, self.settings.multiple)
         return content if content[0] <= height else (height, width)
+
+    def reduce_photo(self, pixels: NDArray, raster: tuple[int, int], ops: Ops) -> tuple[Array, Array]:
+        seen = shrink(pixels, raster)  # as diffusers does, because the model was trained on such pictures
+        return decode_small(seen), seen
 
     def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
         raster = (photo.shape[0], photo.shape[1])
@@ -165,27 +170,24 @@ class Qwen:
 
     def paint(self, x0: Array, condition: Condition) -> Array:
         """The state (tokens, C) -> the picture on the photo's raster (h, w, 3), sRGB-encoded 0..1."""
-        latents = unpack(x0, condition.sizes[0], self.settings.patch)
+        latents = unpack_patches(x0, condition.sizes[0], self.settings.patch)
         pixels = decode_tiled(self._decode, latents, self.settings.factor)
         content = condition.frame.crop((pixels[0].transpose(1, 2, 0) + 1) / 2)
         small = resize(content, condition.raster, Image.Resampling.LANCZOS)
         return np.ascontiguousarray(small.clip(0, 1), np.float32)
 
     def draw(self, strokes: Strokes) -> NDArray[np.uint8]:
-        """Strokes as the model sees them: log(1 + 8 L) / log(1 + 8 peak), black where nothing is said."""
-        light = np.where(strokes.mask[..., None] > 0, strokes.light, 0)
-        encoded = np.log1p(LUMI_SCALE * light) / np.log1p(LUMI_SCALE * self.settings.lumi_peak)
-        return np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8)
+        """Return strokes as the picture that the model sees; unspecified light is black."""
+        return draw_lumi(strokes.light, strokes.mask, self.settings.lumi_peak)
 
     def undraw(self, picture: Array) -> Array:
-        """A picture 0..1 of a Lumi map -> linear light >= 0: the inverse of `draw`."""
-        span = np.float32(np.log1p(LUMI_SCALE * self.settings.lumi_peak))
-        return np.expm1(picture * span) / np.float32(LUMI_SCALE)
+        """Return linear light >= 0 from a picture 0..1 of a Lumi map: the inverse of `draw`."""
+        return undraw_lumi(picture, self.settings.lumi_peak)
 
     def to_tokens(self, picture: NDArray[np.uint8]) -> Array:
         """A picture (h, w, 3), sRGB, of whole tokens -> its tokens (I, C)."""
         pixels = picture.transpose(2, 0, 1)[None].astype(np.float32) / np.float32(127.5) - 1
-        return pack(encode_tiled(self._encode, pixels, self.settings.factor), self.settings.patch)
+        return pack_patches(encode_tiled(self._encode, pixels, self.settings.factor), self.settings.patch)
 
     def turns(self, words: int, sizes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
         """Rotary positions of the words and of all pictures' tokens, (T + I, head / 2)."""
@@ -268,19 +270,6 @@ def _measured(v: Array) -> tuple[Array, Array, Array]:
     largest = np.abs(v).max(axis=-1, keepdims=True)
     unit = np.divide(v, largest, out=np.zeros_like(v), where=largest > 0)
     return unit, largest, np.linalg.norm(unit, axis=-1, keepdims=True)
-
-
-def pack(latents: Array, patch: int) -> Array:
-    """Latents (1, z, h, w) -> tokens (h w / patch^2, z patch^2), row by row."""
-    _, channels, rows, columns = latents.shape
-    split = latents.reshape(channels, rows // patch, patch, columns // patch, patch)
-    return np.ascontiguousarray(split.transpose(1, 3, 0, 2, 4).reshape(-1, channels * patch**2))
-
-
-def unpack(tokens: Array, size: tuple[int, int], patch: int) -> Array:
-    """The inverse of `pack`, for tokens of (rows, columns)."""
-    split = tokens.reshape(*size, -1, patch, patch).transpose(2, 0, 3, 1, 4)
-    return np.ascontiguousarray(split.reshape(1, -1, size[0] * patch, size[1] * patch))
 
 
 @contextlib.contextmanager

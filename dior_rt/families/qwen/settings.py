@@ -15,9 +15,6 @@ MODULATION: Final = "modulation.npy"
 PROMPTS: Final = "prompts.npz"
 MOST_BYTES: Final = 1 << 20
 
-LUMI_SCALE: Final = 8.0  # light L is drawn as log(1 + 8 L) / log(1 + 8 peak)
-LUMI_PEAK: Final = 4.0  # the light that is drawn as white, unless a bundle says otherwise
-
 
 @dataclass(frozen=True)
 class VisionSettings:

@@ -9,8 +9,7 @@ import torch
 from safetensors.torch import load_file
 
 from dior_rt.cli import run
-from dior_rt.export.mini import Recipe as Exported
-from dior_rt.export.mini import export_network
+from dior_rt.export.mini import MiniExportConfig, export_network
 from dior_rt.kernels import Strokes
 from dior_rt.relight import Relighter
 from dior_rt.training.data.triplets import Batches
@@ -61,13 +60,14 @@ def answer(network, batch, sigma: float, noise) -> torch.Tensor:
     return x - sigma * network(x=x, sigma=torch.full((len(x),), sigma), **seen(batch))
 
 
+@pytest.mark.slow
 def test_the_same_walk_as_the_runtimes(tmp_path) -> None:
     network, random = noisy_mini(0), np.random.default_rng(0)
     photo = random.integers(0, 256, (48, 64, 3), np.uint8)
     mask = np.zeros((48, 64), np.float32)
     mask[10:20, 30:50] = 1
     strokes = Strokes((random.uniform(0, 2, (48, 64, 3)) * mask[..., None]).astype(np.float32), mask)
-    exported = Exported(name="small", grid=GRID, steps=5, guidance=1.0, noise_scale=0.5)
+    exported = MiniExportConfig(name="small", grid=GRID, steps=5, guidance=1.0, noise_scale=0.5)
     bundle = export_network(network, exported, tmp_path / "small", weights="fp32")
     expected = np.asarray(Relighter(bundle.folder, ops="numpy").relight(photo, strokes, seed=3).picture)
     got = Network(network, Walk(5, 0.5, seed=3)).relight(photo, strokes)
@@ -175,6 +175,7 @@ FEW = (
 )
 
 
+@pytest.mark.slow
 def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_path) -> None:
     seen = []
     first = replace(FEW[0], walks=(ONCE,))
@@ -206,6 +207,7 @@ def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_
     assert again == evaluation and len(seen) == seen[-1]
 
 
+@pytest.mark.slow
 def test_a_stopped_study_goes_on_with_the_batches_it_had_not_seen(renders, tmp_path) -> None:
 
     def stop(step: int, loss: float) -> None:
