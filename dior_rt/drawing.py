@@ -139,19 +139,19 @@ class Painter:
     def draw(self, name: str, shapes: Sequence[Shape]) -> Strokes:
         """The raster of a layer by its name; the same object as long as its shapes are the same."""
         shapes = tuple(shapes)
-        known = self._layers.pop(name, None)
-        if known is None or known.shapes != shapes:
-            known = self._drawn(shapes, known)
-        self._layers[name] = known
+        layer = self._layers.pop(name, None)
+        if layer is None or layer.shapes != shapes:
+            layer = self._drawn(shapes, layer)
+        self._layers[name] = layer
         while len(self._layers) > self._most:
             del self._layers[next(iter(self._layers))]
-        return known.strokes
+        return layer.strokes
 
-    def _drawn(self, shapes: tuple[Shape, ...], known: _Layer | None) -> _Layer:
+    def _drawn(self, shapes: tuple[Shape, ...], layer: _Layer | None) -> _Layer:
         settled, count = Canvas(self._photo), 0
         last = max(0, len(shapes) - 1)
-        if known and known.count <= last and known.shapes[: known.count] == shapes[: known.count]:
-            settled, count = known.settled, known.count
+        if layer and layer.count <= last and layer.shapes[: layer.count] == shapes[: layer.count]:
+            settled, count = layer.settled, layer.count
         for shape in shapes[count:last]:
             settled.draw(shape)
         canvas = settled.copy()

@@ -38,6 +38,8 @@ Drawing = Strokes | Sequence[Stroke] | Picture | Sequence[Light]
 
 MOST_COVERS = 64  # layers whose light grids an open photo keeps
 
+MOST_SIZES = 4  # sizes of its previews at which an open photo is kept
+
 CANVAS = 2048  # pixels of the longest side on which strokes given as lines are drawn
 
 NOTHING_DRAWN = "The strokes specify nothing, so the photo is unchanged."
@@ -353,6 +355,8 @@ class OpenPhoto:
         height, width = (max(1, round(side * scale)) for side in self.size)
         with self._lock:
             if longest not in self._small:
+                if len(self._small) >= MOST_SIZES:
+                    self._small.clear()
                 # For the eye alone, so Pillow's fast mean of the encoded values will do.
                 image = Image.fromarray(_to_8_bits(self._pixels))
                 reduced = image.resize((width, height), Image.Resampling.BOX, reducing_gap=2.0)
@@ -432,8 +436,8 @@ class OpenPhoto:
     def _cover(self, drawn: Strokes | tuple[Stroke, ...]) -> Cover:
         """The layer on the light grid; kept, for most layers stay as they are while one is drawn."""
         with self._lock:
-            for known, layer in self._covers:
-                if known is drawn:
+            for source, layer in self._covers:
+                if source is drawn:
                     return layer
         raster = drawn if isinstance(drawn, Strokes) else self._relighter._draw(drawn, self.size)
         light, mask = read_strokes(raster)

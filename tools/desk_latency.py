@@ -8,28 +8,28 @@ pen's lifting to the fine preview on the stage. Needs what tools.desk_pictures n
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from PIL import Image
 
 from tools.desk_pictures import ROOT, open_desk, open_page
 
 
-def main() -> None:
+def main(
+    strokes: Annotated[int, typer.Option(min=1, help="How many are drawn on each photo.")] = 50,
+    megapixels: Annotated[tuple[float, float], typer.Option(help="Sizes of the two photos.")] = (1, 24),
+) -> None:
     """Print median and 95th percentile, in milliseconds."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--strokes", type=int, default=50)
-    parser.add_argument("--megapixels", type=float, nargs="+", default=[1, 24])
-    options = parser.parse_args()
-    for megapixels in options.megapixels:
+    for size in megapixels:
         with tempfile.TemporaryDirectory() as folder:
-            times = measure(enlarged(Path(folder), megapixels), options.strokes)
+            times = measure(enlarged(Path(folder), size), strokes)
         p95 = float(np.percentile(times, 95))
-        print(f"{megapixels:g} MP: median {statistics.median(times):.0f} ms, p95 {p95:.0f} ms")
+        print(f"{size:g} MP: median {statistics.median(times):.0f} ms, p95 {p95:.0f} ms")
 
 
 def enlarged(folder: Path, megapixels: float) -> Path:
@@ -63,4 +63,4 @@ def measure(photo: Path, strokes: int) -> list[float]:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -15,8 +15,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
@@ -31,9 +32,10 @@ FLAGS = [
 STROKE = [(0.3, 0.2), (0.28, 0.35), (0.33, 0.55), (0.38, 0.62)]
 
 
-def main() -> None:
+def main(
+    folder: Annotated[Path, typer.Argument(help="Where the pictures go.")] = ROOT / "docs/pictures",
+) -> None:
     """Write desk-draw.jpg, desk-map.jpg, desk-compare.jpg, desk-light.jpg and desk-phone.jpg."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs/pictures"
     with open_desk(ROOT / "examples/coffee.jpg") as link, open_page(link, "dark") as page:
         draw(page, STROKE)
         save(page, folder / "desk-draw.jpg")
@@ -112,4 +114,4 @@ def save(page: Page, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

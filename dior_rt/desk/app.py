@@ -54,8 +54,8 @@ def make_app(studio: Studio, token: str, hosts: frozenset[str], first: Path | No
 
     app = FastAPI(title="The light desk", openapi_url=None, docs_url=None, redoc_url=None, lifespan=lifespan)
     app.add_middleware(Guard, token=token, hosts=hosts)  # type: ignore[arg-type]
-    app.add_exception_handler(DiorError, _tell)
-    app.add_exception_handler(HTTPException, _tell_http)
+    app.add_exception_handler(DiorError, _answer_error)
+    app.add_exception_handler(HTTPException, _answer_http_error)
     _add_page(app)
     _add_photos(app, studio, first)
     _add_light(app, studio)
@@ -276,8 +276,8 @@ async def _body(request: Request, most: int) -> bytes:
 
 async def _limited(request: Request, most: int) -> AsyncIterator[bytes]:
     """The body's parts; 413 as soon as it is, or says it will be, longer than `most` bytes."""
-    said = request.headers.get("content-length", "0")
-    seen = int(said) if said.isdigit() else 0
+    announced = request.headers.get("content-length", "0")
+    seen = int(announced) if announced.isdigit() else 0
     if seen <= most:
         seen = 0
         async for chunk in request.stream():
@@ -289,10 +289,10 @@ async def _limited(request: Request, most: int) -> AsyncIterator[bytes]:
         raise HTTPException(413, f"That is more than {most >> 20} MiB.")
 
 
-def _tell(request: Request, error: Exception) -> JSONResponse:
+def _answer_error(request: Request, error: Exception) -> JSONResponse:
     return JSONResponse({"error": str(error)}, 422)
 
 
-def _tell_http(request: Request, error: Exception) -> JSONResponse:
+def _answer_http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     return JSONResponse({"error": error.detail}, error.status_code)

@@ -68,15 +68,15 @@ class Guard:
             await send(message)
 
         first, slash, rest = scope["path"].removeprefix("/").partition("/")
-        if not (slash and self._is_known(first) and self._is_ours(Headers(scope=scope))):
+        if not (slash and self._has_token(first) and self._is_from_page(Headers(scope=scope))):
             return await PlainTextResponse(STRANGER, 403)(scope, receive, send_guarded)
         inner: dict[str, Any] = {**scope, "path": f"/{rest}", "raw_path": f"/{rest}".encode()}
         await self.app(inner, receive, send_guarded)
 
-    def _is_known(self, token: str) -> bool:
+    def _has_token(self, token: str) -> bool:
         return secrets.compare_digest(token.encode(), self.token.encode())
 
-    def _is_ours(self, headers: Headers) -> bool:
+    def _is_from_page(self, headers: Headers) -> bool:
         host, origin = headers.get("host", ""), headers.get("origin")
         if host not in self.hosts or origin not in (None, f"http://{host}"):
             return False

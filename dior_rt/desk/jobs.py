@@ -107,7 +107,7 @@ class Queue:
             job = Job(work)
             job.move(State("queued", ahead=len(self._open())))
             self._jobs[job.id] = job
-            over = [known for known in self._jobs.values() if known.state.stage in FINAL]
+            over = [one for one in self._jobs.values() if one.state.stage in FINAL]
             for old in over[: max(0, len(over) - self._kept)]:
                 del self._jobs[old.id]
         self._pool.submit(self._run, job)

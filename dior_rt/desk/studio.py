@@ -98,8 +98,8 @@ class Studio:
     def open(self, path: Path, name: str) -> Shown:
         """Put the photo of a file on the desk. Raises InputError."""
         digest = hash_file(path)
-        if known := self.photo(digest):
-            return replace(known, name=name)
+        if shown := self.photo(digest):
+            return replace(shown, name=name)
         try:
             photo = read_photo(path)
         except InputError as error:
