@@ -17,6 +17,7 @@ import numpy as np
 import typer
 from PIL import Image
 
+from tools.command import start
 from tools.desk_pictures import ROOT, open_desk, open_page
 
 
@@ -63,4 +64,4 @@ def measure(photo: Path, strokes: int) -> list[float]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    start(main)

@@ -21,6 +21,8 @@ import typer
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
+from tools.command import start
+
 ROOT = Path(__file__).parents[1]
 FLAGS = [
     "--no-sandbox",
@@ -114,4 +116,4 @@ def save(page: Page, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    start(main)
