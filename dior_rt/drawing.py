@@ -29,6 +29,9 @@ from dior_rt.kernels import Strokes
 #: Pixels of the longer side on which shapes are drawn: far finer than a light grid, and bounded.
 CANVAS: Final = 768
 
+#: Sigma of a fill's soft edge at softness 1, as a share of the fill's longer side.
+FILL_BLUR: Final = 0.15
+
 #: The least share of its width and flow that a stroke keeps under the lightest pressure.
 LIGHTEST: Final = 0.1
 
@@ -213,7 +216,7 @@ def _edge(t: Array, softness: float) -> Array:
 def _fill(shape: Shape, size: tuple[int, int], scale: Array) -> Covered:
     points = np.asarray(shape.points, np.float64) * scale
     fine = 2  # samples a side of a pixel
-    blur = shape.paint.softness * 0.15 * float(np.ptp(points, axis=0).max(initial=0))
+    blur = shape.paint.softness * FILL_BLUR * float(np.ptp(points, axis=0).max(initial=0))
     box = _box(points, 2 * blur + 1, size)
     height, width = (side.stop - side.start for side in box)
     if min(height, width) <= 0 or len(points) < 3:

@@ -62,6 +62,7 @@ def _listen(port: int | None) -> socket.socket:
         if os.name != "nt":  # there it would let two programs share the port
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((HOST, port or 0))
+        listener.listen()  # so that who follows the link at once waits and is not refused
         return listener
     except (OSError, OverflowError) as error:
         listener.close()

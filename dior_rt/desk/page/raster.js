@@ -3,6 +3,7 @@
 import { toCss } from './color.js';
 
 const RINGS = 8; // nested outlines that stand for a soft edge
+const FILL_BLUR = 0.15; // sigma of a fill's soft edge, in its longer side
 const LIGHTEST = 0.1; // share of width that a stroke keeps under the lightest pressure
 
 /** Draw one shape, in photo pixels, over what the context holds. `tint` multiplies its colour. */
@@ -58,11 +59,18 @@ function outline(shape, scale) {
 }
 
 function drawFill(ctx, shape) {
+  const extent = Math.max(...[0, 1].map((axis) => {
+    const along = shape.points.map((point) => point[axis]);
+    return Math.max(...along) - Math.min(...along);
+  }));
+  // A filter's lengths are pixels of the canvas. Browsers without filters show a hard edge.
+  const { a, b } = ctx.getTransform();
+  if (shape.softness > 0) ctx.filter = `blur(${FILL_BLUR * shape.softness * extent * Math.hypot(a, b)}px)`;
   ctx.globalAlpha = shape.flow;
   ctx.beginPath();
   shape.points.forEach(([x, y], i) => (i ? ctx.lineTo(x, y) : ctx.moveTo(x, y)));
   ctx.closePath();
-  ctx.fill('nonzero');
+  ctx.fill('evenodd');
 }
 
 function drawGradient(ctx, shape, color) {

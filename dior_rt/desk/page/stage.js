@@ -111,7 +111,7 @@ export class Stage {
     ctx.clip();
     if (shape.kind === 'fill') {
       ctx.globalAlpha = 0.4;
-      drawShape(ctx, { ...shape, flow: 0.4, erase: false });
+      drawShape(ctx, { ...shape, flow: 0.4, erase: false, softness: 0 });
     } else {
       drawShape(ctx, { ...shape, flow: 0.45 * shape.flow, erase: false, color: shape.erase ? [0, 0, 0] : shape.color });
     }
