@@ -11,6 +11,7 @@ export class Previewer {
   #busy = false;
   #wish = null;
   #idle = 0;
+  #newest = 0;
 
   /** show({blob, asked, fine}) or show({error}); busy(whether). asked: when, fine: whether the pen had lifted. */
   constructor(backend, show, busy) {
@@ -24,12 +25,6 @@ export class Previewer {
   ask(photo, project, moving = false) {
     clearTimeout(this.#idle);
     this.#wish = { photo, project, longest: moving ? COARSE : FINE, asked: performance.now() };
-    if (!moving && this.finest > FINE) {
-      this.#idle = setTimeout(() => {
-        this.#wish = { photo, project, longest: this.finest, asked: performance.now() };
-        this.#work();
-      }, IDLE);
-    }
     // What the pen's lifting asks for does not wait for a coarse one: the server drops that.
     if (!this.#busy || !moving) this.#work();
   }
@@ -39,9 +34,16 @@ export class Previewer {
     clearTimeout(this.#idle);
     this.#wish = null;
     this.#newest += 1;
+    this.#busy = false;
+    this.busy(false);
   }
 
-  #newest = 0;
+  #refineLater({ photo, project }) {
+    this.#idle = setTimeout(() => {
+      this.#wish = { photo, project, longest: this.finest, asked: performance.now() };
+      this.#work();
+    }, IDLE);
+  }
 
   async #work() {
     const number = ++this.#newest;
@@ -52,7 +54,10 @@ export class Previewer {
       this.#wish = null;
       try {
         const blob = await this.#backend.preview(wish.photo, wish.project, wish.longest);
-        if (blob && number === this.#newest) await this.#show({ blob, asked: wish.asked, fine: wish.longest === FINE });
+        if (!blob || number !== this.#newest) continue;
+        const fine = wish.longest === FINE;
+        await this.#show({ blob, asked: wish.asked, fine });
+        if (fine && this.finest > FINE && number === this.#newest && !this.#wish) this.#refineLater(wish);
       } catch (error) {
         if (number === this.#newest) this.#show({ error });
       }
