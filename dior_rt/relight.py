@@ -23,8 +23,16 @@ from dior_rt.families import open_family
 from dior_rt.flow.adaptive import sample_within
 from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.flow.schedule import ShiftSchedule
-from dior_rt.images.arrays import Picture, check_same_shape, like_photo, read_pixels, read_strokes
+from dior_rt.images.arrays import (
+    Picture,
+    check_same_shape,
+    in_primaries_of,
+    like_photo,
+    read_pixels,
+    read_strokes,
+)
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
+from dior_rt.kernels.types import STRONGEST
 from dior_rt.light import decode_small
 from dior_rt.lights import Composed, Cover, Light, compose, cover
 from dior_rt.presets import ALWAYS, REFERENCE, read_presets
@@ -129,6 +137,11 @@ class Relighter:
         return self._ops.reason
 
     @property
+    def ops_notice(self) -> str:
+        """What the user should know of that choice, such as a driver that crashes; "" for nothing."""
+        return self._ops.notice
+
+    @property
     def presets(self) -> tuple[str, ...]:
         """The names that `relight` takes as its preset. Raises BundleError."""
         return REFERENCE, *read_presets(self.bundle)
@@ -164,7 +177,8 @@ class Relighter:
     ) -> Relit:
         """Return the photo under the light of the strokes.
 
-        photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
+        photo: a Pillow image, which is read as its file would be (upright by its EXIF, in the colours of its
+          profile); or an array (H, W, 3), sRGB, of uint8, uint16, or float32 in 0..1.
         strokes: one of
           - Strokes, or RGBA as a Pillow image or an array (H, W, 4), shaped like the photo or like its light
             grid, of any size; alpha 0 = unspecified, integers are sRGB-encoded and floats linear;
@@ -230,9 +244,10 @@ class Relighter:
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
         drawn = self._ops.reduce_strokes(light, mask, raster)
-        with np.errstate(over="ignore", invalid="ignore"):
-            drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
-        if not np.isfinite(drawn.light).all():
+        # In float64, which holds the product of any strokes and any intensity that is allowed.
+        light = drawn.light.astype(np.float64) * intensity
+        drawn = Strokes(light.clip(max=STRONGEST).astype(np.float32), drawn.mask)
+        if not light.max() <= STRONGEST:
             raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
         return drawn
 
@@ -401,7 +416,7 @@ class OpenPhoto:
         watch = Stopwatch()
         composed = self._target(lights, intensity, reach)
         if not composed.target.mask.any():
-            unchanged = like.copy()
+            unchanged = like_photo(pixels.copy(), like)
             return Relit(unchanged, NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
         source, encoded = self._reduced
         watch.lap("kernels")
@@ -420,7 +435,7 @@ class OpenPhoto:
             if reach is not None:
                 lights = [replace(light, reach=light.reach or reach) for light in lights]
             return self._compose(lights, intensity)
-        strokes = cast("Strokes | Sequence[Stroke] | Picture", lights)
+        strokes = in_primaries_of(self.photo, cast("Strokes | Sequence[Stroke] | Picture", lights))
         drawn = self._relighter._reduce_strokes(strokes, self.size, self._raster, intensity)
         near = None if reach is None else closeness(drawn.mask > 0, reach)
         return Composed(drawn, near)

@@ -1,4 +1,4 @@
-"""The pixel kernels: OpenCL C, their host code, and a NumPy twin of each. Imported as ``dior_rt.kernels``.
+"""Pixel operations in OpenCL C and in NumPy. Imported as ``dior_rt.kernels``.
 
 ops = open_ops("auto")
 grid = ops.reduce_photo(photo, (64, 64))
@@ -40,7 +40,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # pyopencl is loaded only by those who ask for OpenCL.
+    # Load pyopencl only when OpenCL is used.
     if name == "OpenCLOps":
         prepare_caches()
         from dior_rt.kernels.opencl_ops import OpenCLOps

@@ -1,4 +1,4 @@
-"""The words of the kernels: a stroke as drawn, strokes as a raster, and what goes wrong."""
+"""The types of the kernels: a drawn stroke, rasterised strokes, a device, and the error."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-#: Pixels: farther points and wider strokes are refused.
+#: In pixels: farther points and wider strokes are refused.
 FARTHEST = 1e9
+#: Times display white: stronger light is refused, since products of it leave float32's range.
+STRONGEST = 1e9
 
 FloatArray = npt.NDArray[np.float32]
 Picture = npt.NDArray[Any]  # uint8, uint16 or float32
 
 
 class KernelError(ValueError):
-    """A device that was asked for by name and is not there, or that computes wrong results."""
+    """A named device that is not available, or a device that computes wrong results."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,11 @@ class Device:
 
 @dataclass(frozen=True)
 class Stroke:
-    """One pull of the brush: a polyline with round caps; a single point is a dot.
+    """One stroke of the brush: a polyline with round caps. A single point is a dot.
 
     points: ((x, y), ...) in pixels; (0, 0) is the upper left corner of the picture, (0.5, 0.5) the centre of
     its first pixel; points may lie outside. width: pixels, > 0. color: linear RGB. intensity: the light is
-    color * intensity, both >= 0. softness: the share of the half width over which the edge fades, 0 hard ..
-    1.
+    color * intensity, both >= 0. softness: the share of the half width over which the edge fades; 0 is hard.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -56,12 +57,14 @@ class Stroke:
             raise ValueError(f"a stroke's width must lie between 0 and {FARTHEST:g} pixels, not {self.width}")
         if len(self.color) != 3 or not all(math.isfinite(c) and c >= 0 for c in self.light):
             raise ValueError("a stroke's color must be three finite numbers >= 0, and its intensity one")
+        if max(self.light) > STRONGEST:
+            raise ValueError(f"a stroke's color times its intensity must be at most {STRONGEST:g}")
         if not 0 <= self.softness <= 1:
             raise ValueError(f"a stroke's softness must lie in 0..1, not {self.softness}")
 
     @property
     def light(self) -> tuple[float, ...]:
-        """The linear RGB that the stroke says falls here: color * intensity."""
+        """The drawn light in linear RGB: color * intensity."""
         return tuple(c * self.intensity for c in self.color)
 
 

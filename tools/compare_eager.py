@@ -67,14 +67,14 @@ def eager() -> Callable[[Condition], Velocity]:
 
     @torch.inference_mode()
     def bind(condition: Condition) -> Velocity:
-        given = {name: torch.from_numpy(array) for name, array in condition.items()}
-        own = network.own_light(given["photo"])
-        features = network.encode(given["photo"], given["light"], given["mask"], own)
+        inputs = {name: torch.from_numpy(array) for name, array in condition.items()}
+        source = network.estimate_source(inputs["photo"])
+        features = network.encode(inputs["photo"], inputs["light"], inputs["mask"], source)
 
         @torch.inference_mode()
         def velocity(x: Array, sigma: float) -> Array:
             sigmas = torch.full((len(x),), sigma)
-            return network.step(torch.from_numpy(x), sigmas, given["mode"], *features).numpy()
+            return network.step(torch.from_numpy(x), sigmas, inputs["mode"], *features).numpy()
 
         return velocity
 

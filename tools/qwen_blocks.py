@@ -121,7 +121,7 @@ def measure(
     weights = RandomWeights(config, 0)
     block = load_block(config, weights, 0)
     feeds, inputs = block_inputs(config, block, seed=0, words=WORDS, sizes=tuple(sizes))
-    given, want = np.concatenate([feeds["text"], feeds["image"]]), run_block(block, inputs)
+    before, want = np.concatenate([feeds["text"], feeds["image"]]), run_block(block, inputs)
     measured = []
     with tempfile.TemporaryDirectory() as scratch:
         for precision in precisions:
@@ -134,7 +134,7 @@ def measure(
             for _ in range(runs):
                 here.append(seconds(partial(engine.run, feeds)))
                 torch_here.append(seconds(partial(run_block, block, inputs)))
-            error = relative(got - given, want - given)
+            error = relative(got - before, want - before)
             size = path.with_suffix(".data").stat().st_size
             measured.append(Measured(precision, median(here), median(torch_here), error, size))
             path.with_suffix(".data").unlink()

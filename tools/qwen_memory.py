@@ -37,11 +37,11 @@ def peak(blocks: int, precision: Precision = "fp32") -> float:
         make_model(folder, blocks)
         # A process begun afresh: a copy of this one would start from this one's own peak.
         context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=write, args=(folder, precision, theirs))
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=write, args=(folder, precision, sender))
         process.start()
-        theirs.close()
-        found = ours.recv()
+        sender.close()
+        found = receiver.recv()
         process.join()
     return float(found)
 

@@ -38,7 +38,7 @@ from dior_rt.training.light import (
 
 MULTIPLE: Final = 32
 LOCAL: Final[dict[str, Any]] = {"local_files_only": True, "use_safetensors": True}
-SAID: Final = {MODES["relight"]: Prompts.relight, MODES["estimate"]: Prompts.estimate}
+DEFAULT_PROMPTS: Final = {MODES["relight"]: Prompts.relight, MODES["estimate"]: Prompts.estimate}
 ADAPTER: Final = "light"
 TARGETS: Final = [
     *(f"to_{role}" for role in ("q", "k", "v", "out.0", "add_out")),
@@ -225,7 +225,7 @@ def dtype_of(plan: Plan) -> torch.dtype:
 
 
 @torch.no_grad()
-def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor]:
+def embed_prompts(folder: Path, prompts: dict[int, str] = DEFAULT_PROMPTS) -> dict[int, Tensor]:
     """The embeddings (T, D) of each mode's prompt in the model's template, less its first words.
 
     Raises InputError where the folder has no text encoder.
@@ -238,7 +238,7 @@ def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"Cannot read the text encoder in {folder}: {reason(error)}.") from error
     embeddings = {}
-    for mode, words in said.items():
+    for mode, words in prompts.items():
         tokens = tokenizer(TEMPLATE.format(words), return_tensors="pt")
         hidden = encoder(**tokens, output_hidden_states=True).hidden_states[-1]
         embeddings[mode] = hidden[0, SKIP:].float()

@@ -138,12 +138,12 @@ def _profile(
     return [event for event in events if event["name"].endswith("_kernel_time")]
 
 
-def _side(side: int | str, known: Mapping[str, int]) -> int:
+def _side(side: int | str, sides: Mapping[str, int]) -> int:
     """Return the length of a side such as 3, "rows" or "4*rows"."""
     if isinstance(side, int):
         return side
     factor, _, name = side.rpartition("*")
-    return int(factor or 1) * known[name]
+    return int(factor or 1) * sides[name]
 
 
 def _shapes(described: Sequence[Mapping[str, Any]]) -> list[Shape]:

@@ -63,7 +63,7 @@ class Setting:
 def reference_of(bundles: Sequence[Bundle], ops: str) -> Setting:
     """Return the reference: the first bundle in fp32, or else the first, with its own settings on the CPU."""
     bundle = next((bundle for bundle in bundles if bundle.manifest.precision == "fp32"), bundles[0])
-    return _own(bundle, ops)
+    return _default_setting(bundle, ops)
 
 
 def sweep(
@@ -80,19 +80,22 @@ def sweep(
     A new kind of setting is one more line here.
     """
     reference = reference_of(bundles, ops[0])
-    own = next(bundle for bundle in bundles if str(bundle.folder) == reference.bundle)
+    bundle_of_reference = next(bundle for bundle in bundles if str(bundle.folder) == reference.bundle)
     return list(
         dict.fromkeys(
             [
                 reference,
                 *(replace(reference, steps=count) for count in steps),
                 replace(reference, guidance=1.0),  # one branch of the network instead of two
-                *(_ways(reference, own) if ways else ()),
-                *(replace(reference, preset=name, steps=None, solver=None) for name in read_presets(own)),
+                *(_ways(reference, bundle_of_reference) if ways else ()),
+                *(
+                    replace(reference, preset=name, steps=None, solver=None)
+                    for name in read_presets(bundle_of_reference)
+                ),
                 *(replace(reference, threads=count) for count in threads),
                 *(replace(reference, ops=name) for name in ops),
                 *(replace(reference, device=name) for name in devices),
-                *(_own(bundle, ops[0]) for bundle in bundles),
+                *(_default_setting(bundle, ops[0]) for bundle in bundles),
             ]
         )
     )
@@ -133,7 +136,7 @@ def _ways(reference: Setting, bundle: Bundle) -> list[Setting]:
     ]
 
 
-def _own(bundle: Bundle, ops: str) -> Setting:
+def _default_setting(bundle: Bundle, ops: str) -> Setting:
     manifest = bundle.manifest
     return Setting(
         bundle=str(bundle.folder),

@@ -74,12 +74,12 @@ def keep(
     for case in cases:
         reference, seconds = _timed(relighter, case, {})
         for name, how in ways.items():
-            relit, own = _timed(relighter, case, how)
+            relit, spent = _timed(relighter, case, how)
             found[name].append(
                 (
                     decibels(relit, np.asarray(reference.picture)),
                     reference.seconds["steps"] / relit.seconds["steps"],
-                    seconds / own,
+                    seconds / spent,
                     relit.steps,
                 )
             )
@@ -113,17 +113,17 @@ def candidates(bundle: Bundle) -> list[Preset]:
 
 def find(relighter: Relighter, cases: Sequence[Case], say: Callable[[str], None]) -> dict[str, Preset]:
     """Return the cheapest candidate that keeps each promise with a margin in every case, or the reference."""
-    found, own = {}, Preset(relighter.bundle.manifest.steps)
+    found, full = {}, Preset(relighter.bundle.manifest.steps)
     left = iter(candidates(relighter.bundle))
     references: dict[int, NDArray] = {}
     hardest = list(range(len(cases)))  # cases that failed a candidate come first
-    kept, cheapest = 0.0, own
+    kept, cheapest = 0.0, full
     for name, promise in sorted(PROMISES.items(), key=lambda item: item[1]):
         if kept >= promise + MARGIN:  # the preset of a weaker promise also keeps this one
             found[name] = cheapest
             continue
-        found[name] = own
-        for candidate in _cheaper(left, relighter.bundle, own):
+        found[name] = full
+        for candidate in _cheaper(left, relighter.bundle, full):
             worst = IDENTICAL
             for index in list(hardest):
                 case = cases[index]
@@ -153,9 +153,9 @@ def write_presets(bundle: Bundle, presets: Mapping[str, Preset]) -> Bundle:
         return write_bundle(bundle.folder, bundle.manifest, files, overwrite=True)
 
 
-def _cheaper(left: Iterator[Preset], bundle: Bundle, own: Preset) -> Iterator[Preset]:
+def _cheaper(left: Iterator[Preset], bundle: Bundle, full: Preset) -> Iterator[Preset]:
     """Return the candidates that cost less than the reference."""
-    return (candidate for candidate in left if cost(candidate, bundle) < cost(own, bundle))
+    return (candidate for candidate in left if cost(candidate, bundle) < cost(full, bundle))
 
 
 def _timed(relighter: Relighter, case: Case, how: Mapping[str, Any]) -> tuple[Relit, float]:

@@ -143,9 +143,9 @@ def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Samp
             raise DeviceError(answer["error"])
         return parse(Sample, answer)
     except (ValueError, IndexError, TypeError):
-        said = process.stderr.strip().splitlines() or ["it printed nothing"]
+        output = process.stderr.strip().splitlines() or ["it printed nothing"]
         where = f"{setting.device} and {setting.ops}"
-        raise DeviceError(f"The run on {where} ended with code {process.returncode}: {said[-1]}.") from None
+        raise DeviceError(f"The run on {where} ended with code {process.returncode}: {output[-1]}.") from None
 
 
 def _steps(settings: Sequence[Setting], pairs: Sequence[Pair]) -> dict[Step, Bundle]:

@@ -99,7 +99,7 @@ def _changed(new: Report, old: Report) -> list[str]:
         "photos": (new.photos, old.photos),
         "reference": (new.results[0].setting, old.results[0].setting),
     }
-    return [name for name, (ours, theirs) in pairs.items() if ours != theirs]
+    return [name for name, (new, old) in pairs.items() if new != old]
 
 
 def _decibels(result: Result) -> str:

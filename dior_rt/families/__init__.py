@@ -1,8 +1,7 @@
-"""The model families: how each turns a photo and strokes into network inputs, and outputs into light.
+"""The model families: each turns a photo and strokes into network inputs, and network outputs into light.
 
-A bundle names its family. `mini` and `qwen` are built in; any installed package can add a family with an
-entry
-point of the group `dior_rt.families`, whose value is a callable `(bundle, device, threads) -> Family`:
+A bundle names its family. `mini` and `qwen` are built in. Any installed package can add a family with an
+entry point of the group `dior_rt.families`, whose value is a callable `(bundle, device, threads) -> Family`:
 
     [project.entry-points."dior_rt.families"]
     watercolour = "my_package.family:Watercolour"
@@ -34,7 +33,7 @@ BUILT_IN: Final = {"mini": "dior_rt.families.mini:Mini", "qwen": "dior_rt.famili
 class Family(Protocol[C]):
     """A bundle of one family, loaded on a device and safe to use from several threads. C is its condition.
 
-    device, reason: what runs the networks, and why.
+    device, reason: the device that runs the networks, and why it was chosen.
     """
 
     device: str
@@ -47,7 +46,7 @@ class Family(Protocol[C]):
         """Return a photo (H, W, 3), sRGB, on its raster (h, w, 3): in linear light, and sRGB-encoded 0..1."""
 
     def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> C:
-        """Return what the network sees of a photo (h, w, 3), sRGB 0..1, and of strokes of the same raster."""
+        """Return the condition for a photo (h, w, 3), sRGB 0..1, and strokes on the same raster."""
 
     def noise_shape(self, condition: C) -> tuple[int, ...]:
         """Return the shape of the flow's state."""
@@ -71,7 +70,7 @@ Opener = Callable[[Bundle, str, "int | None"], Family[Any]]
 def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:
     """Load a bundle's networks on a device.
 
-    Raises BundleError for a family that is not installed, and what the family raises.
+    Raises BundleError for a family that is not installed, and the errors of the family.
     """
     return _find(bundle)(bundle, device, threads)
 

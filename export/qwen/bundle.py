@@ -1,4 +1,4 @@
-"""The export: a diffusers folder and LoRAs to one bundle, part by part, held to torch and to float32."""
+"""Export a diffusers folder and LoRAs to a bundle, and compare each part with torch and float32."""
 
 from __future__ import annotations
 
@@ -37,41 +37,41 @@ from dior_rt.records import unparse
 AREA: Final = 1024**2
 VISION_AREA: Final = 384**2
 BYTES: Final = {"fp32": 4.0, "fp16": 2.0, "int8": 1.0, "int4": 0.625}  # a weight
-LIGHTNING_SHIFT: Final = 3.0  # few-step LoRAs are trained with mu = ln 3, whatever the size
+LIGHTNING_SHIFT: Final = 3.0  # few-step LoRAs are trained with mu = ln 3 at every size
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class QwenExportConfig:
-    """What to make of a model."""
+    """How to export a model."""
 
     name: str = "Qwen-Image-Edit"
     licence: str = "Apache-2.0"
-    #: Of the transformer's blocks and of the text encoder's layers.
+    #: Precision of the transformer's blocks and of the text encoder's layers.
     precision: Precision = "fp32"
-    #: Steps that the bundle takes unless told otherwise.
+    #: Default number of steps.
     steps: int = 40
-    #: Guidance that the bundle uses unless told otherwise.
+    #: Default guidance.
     guidance: float = 4.0
-    #: None takes the model's.
+    #: Schedule; None takes the model's.
     schedule: Schedule | None = None
     #: Keep the weights that compute modulation, a third of the transformer, so that any number of steps can
     #: be run; without them the bundle is for `steps` alone.
     free_steps: bool = False
     #: Store the prompts' embeddings, computed without the pictures, and leave the text encoder out; for LoRAs
-    #: that were trained so.
+    #: that were trained this way.
     prompt_cache: bool = False
     prompts: Prompts = field(default_factory=Prompts)
     #: Pixels of the pictures that the bundle paints.
     area: int = AREA
     #: Pixels of the pictures that the prompts' encoder sees.
     vision_area: int = VISION_AREA
-    #: Pixels of the picture by which the cost of a precision is measured.
+    #: Pixels of the picture on which the error of a precision is measured.
     probe_area: int = 256**2
 
     def few_steps(self, steps: int) -> QwenExportConfig:
-        """The same for a few-step LoRA: its schedule, no guidance."""
+        """Return the config for a few-step LoRA: its schedule, no guidance."""
         return replace(self, steps=steps, guidance=1.0, schedule=ShiftSchedule(LIGHTNING_SHIFT))
 
 
@@ -87,9 +87,9 @@ def export_qwen(
 ) -> Bundle:
     """Write the bundle of a diffusers folder at `out`.
 
-    files: of weights in place of the folder's. progress: told of each part when it is written.
-    Raises InputError for what cannot be exported, ExportError where a graph computes something else than
-    torch, and BundleError where nothing can be written. Nothing is left at `out` then.
+    files: weights to use instead of the folder's. progress: called with each part when it is written.
+    Raises InputError for a model that cannot be exported, ExportError if a graph differs from torch, and
+    BundleError if nothing can be written. Then nothing is left at `out`.
     """
     check_target(out, overwrite)
     sources = Sources(folder, loras, files)
@@ -113,13 +113,13 @@ def export_qwen(
 
 @dataclass
 class _Draft:
-    """A bundle in the making: its files in a folder of their own, and what is known of them so far."""
+    """A bundle under construction: its folder, its files and their errors."""
 
     folder: Path
     progress: Progress
     #: Graphs by name, their files relative to the folder.
     graphs: dict[str, Graph] = field(default_factory=dict)
-    #: Files that are no graphs.
+    #: Files other than graphs.
     data: list[str] = field(default_factory=list)
     #: The largest errors of the parts against torch, by part.
     parity: dict[str, float] = field(default_factory=dict)
@@ -142,14 +142,14 @@ class _Draft:
         self.parity[figure] = max(error, self.parity.get(figure, 0.0))
 
     def files(self) -> dict[str, Path]:
-        """Return relative path -> file, of everything that belongs into the bundle."""
+        """Return relative path -> file, of everything that belongs to the bundle."""
         graphs = [graph.file for graph in self.graphs.values()]
         weights = [str(PurePosixPath(graph).with_suffix(".data")) for graph in graphs]
         names = (*graphs, *weights, *self.data)
         return {name: self.folder / name for name in names if (self.folder / name).is_file()}
 
     def bundle(self, config: QwenExportConfig, schedule: Schedule) -> Bundle:
-        """Return the bundle as it lies in the folder, ready to run; its files' hashes are not known yet."""
+        """Return the bundle in the folder, ready to run, but without the hashes of its files."""
         manifest = Manifest(
             family="qwen",
             name=config.name,
@@ -170,7 +170,7 @@ class _Draft:
 def _write_draft(
     folder: Path, sources: Sources, config: QwenExportConfig, schedule: Schedule, progress: Progress
 ) -> _Draft:
-    """Write all files of a bundle into a folder, and compare each part with torch's; see `export_qwen`."""
+    """Write all files of a bundle into a folder, and compare each part with torch. See `export_qwen`."""
     draft = _Draft(folder, progress)
     _write_transformer(draft, sources, config.precision)
     _write_vae(draft, sources)
@@ -184,7 +184,7 @@ def _write_draft(
 
 
 def _write_transformer(draft: _Draft, sources: Sources, precision: Precision) -> None:
-    """Write a graph for each block, and one for what comes before and after them."""
+    """Write a graph for each block, one before them and one after them."""
     config, weights = sources.transformer, sources.transformer_weights
     for name, graph in write_transformer(draft.part("transformer"), config, weights, precision):
         path = draft.add("transformer", name, graph)
@@ -285,12 +285,12 @@ def _settings(
 
 
 def _check_room(sources: Sources, config: QwenExportConfig, out: Path) -> None:
-    """BundleError where the disk is too small for what will be written."""
+    """Raise BundleError if the disk has too little room for the export."""
     needed = _bytes(sources, config, config.precision)
     if config.precision != "fp32":
         needed += _bytes(sources, config, "fp32")
     if config.prompt_cache:
-        needed += _text_bytes(sources, "fp32")  # for a while
+        needed += _text_bytes(sources, "fp32")  # temporarily
     parent = next(folder for folder in out.resolve().parents if folder.exists())
     free = shutil.disk_usage(parent).free
     if free < needed:
@@ -301,7 +301,7 @@ def _check_room(sources: Sources, config: QwenExportConfig, out: Path) -> None:
 
 
 def _bytes(sources: Sources, config: QwenExportConfig, precision: Precision) -> float:
-    """About what a bundle takes; modulation and the autoencoder are float32 in all of them."""
+    """Return the approximate size of a bundle. Modulation and the autoencoder are always float32."""
     base, transformer = sources.transformer_base, sources.transformer
     modulation = sum(math.prod(base.shape(name)) for name in base.names if "_mod.1." in name)
     table = (config.steps + 1) * (12 * transformer.num_layers + 2) * transformer.width
@@ -315,5 +315,5 @@ def _text_bytes(sources: Sources, precision: Precision) -> float:
 
 
 def _count(weights: Checkpoint, starts: tuple[str, ...] = ("",)) -> int:
-    """The numbers in the tensors whose names start so."""
+    """Return how many numbers the tensors with these prefixes hold."""
     return sum(math.prod(weights.shape(name)) for name in weights.names if name.startswith(starts))

@@ -45,9 +45,9 @@ def check_block(
     feeds, inputs = block_inputs(config, block, seed=index, words=WORDS, sizes=SIZES)
     want = run_block(block, inputs)
     made = Engine(path).run(feeds)
-    given = np.concatenate([feeds["text"], feeds["image"]])
+    before = np.concatenate([feeds["text"], feeds["image"]])
     got = np.concatenate([made["text_out"], made["image_out"]])
-    error = float(np.linalg.norm(got - want) / np.linalg.norm(want - given))
+    error = float(np.linalg.norm(got - want) / np.linalg.norm(want - before))
     if not error <= BLOCK_BAR[precision]:
         raise ExportError(
             f"Block {index} differs from diffusers by {error:.2g} of what it computes; "

@@ -123,8 +123,8 @@ class Sources:
 
     def word_ids(self, prompt: str, pictures: int) -> tuple[int, ...]:
         """Return the word ids of a prompt in its template, with room for that many pictures."""
-        said = "".join(PICTURE.format(k + 1) for k in range(pictures)) + prompt
-        ids = tuple(self._tokenizer(TEMPLATE.format(said))["input_ids"])
+        words = "".join(PICTURE.format(k + 1) for k in range(pictures)) + prompt
+        ids = tuple(self._tokenizer(TEMPLATE.format(words))["input_ids"])
         if ids.count(self._picture_id()) != pictures:
             raise InputError(f"The tokenizer of {self.folder} does not know the word for a picture.")
         return ids

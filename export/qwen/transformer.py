@@ -53,13 +53,13 @@ class TransformerConfig:
             if found.get(name):
                 raise InputError(f"{path} sets {name}, so it is not Qwen-Image-Edit.")
         try:
-            known = {
+            fields = {
                 name: found[name]
                 for name in cls.__dataclass_fields__
                 if name not in ("zero_cond_t", "patch_size")
             }
-            known["axes_dims_rope"] = tuple(known["axes_dims_rope"])
-            return cls(zero_cond_t=bool(found.get("zero_cond_t", False)), **known)
+            fields["axes_dims_rope"] = tuple(fields["axes_dims_rope"])
+            return cls(zero_cond_t=bool(found.get("zero_cond_t", False)), **fields)
         except (KeyError, TypeError) as error:
             raise InputError(
                 f"{path} describes no QwenImageTransformer2DModel: {error} is missing."

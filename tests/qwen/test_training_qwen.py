@@ -22,7 +22,7 @@ from dior_rt.training import qwen as training
 from dior_rt.training.data.render import View
 from dior_rt.training.data.triplets import Batches, load_views
 from dior_rt.training.fit import Plan, flow_loss
-from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_own_strokes
+from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_estimated_strokes
 
 SAID = {MODES["relight"]: "light it from the left", MODES["estimate"]: "draw its light"}
 
@@ -208,7 +208,7 @@ def test_stage_two_lowers_the_loss_on_real_pairs_it_has_not_drawn(
     assert len(losses) == 10 and np.isfinite(losses).all()
     unseen = MixedBatches(scenes, Batches(load_views(renders), 2, seed=9), (77,), 0, 0.5)
     before = backbone(file)
-    asked = with_own_strokes(before, next(iter(unseen)), 2, plan.shift)
+    asked = with_estimated_strokes(before, next(iter(unseen)), 2, plan.shift)
     given = before.prepare(asked)
     noise = torch.randn(given["x0"].shape, generator=torch.Generator().manual_seed(0))
 

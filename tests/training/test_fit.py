@@ -136,9 +136,9 @@ def test_the_photos_own_light_is_learnt_from_every_sample(views) -> None:
     batch, network = next(iter(Batches(views, 8, seed=3))), Mini(TINY)
     noise, sigma = torch.randn_like(batch["x0"]), torch.ones(8)
     without = {name: value for name, value in batch.items() if name != "own"}
-    plain, whole = (flow_loss(network, each, sigma, noise, own=0.5) for each in (without, batch))
+    plain, whole = (flow_loss(network, each, sigma, noise, source_weight=0.5) for each in (without, batch))
     _, light = network(
-        noise, sigma, batch["photo"], batch["light"], batch["mask"], batch["mode"], with_own=True
+        noise, sigma, batch["photo"], batch["light"], batch["mask"], batch["mode"], with_source=True
     )
     error = (2 * light - 1 - batch["own"]).square().mean()
     torch.testing.assert_close(whole, plain + 0.5 * error)
@@ -212,12 +212,12 @@ class Brush(torch.nn.Module):
         super().__init__()
         self.power = torch.nn.Parameter(torch.tensor(power))
 
-    def forward(self, x, sigma, photo, light, mask, mode, own=None, with_own=False):
+    def forward(self, x, sigma, photo, light, mask, mode, own=None, with_source=False):
         linear = srgb_to_linear(photo)
         ratio = self.power * torch.log((light + BOUNCED) / (0.25 + BOUNCED)) * mask
         relit = ((linear + FLOOR) * torch.exp(ratio) - FLOOR).clamp(0, 1)
         velocity = RELIT_SCALE * (photo - linear_to_srgb(relit))
-        return (velocity, torch.full_like(photo, 0.25)) if with_own else velocity
+        return (velocity, torch.full_like(photo, 0.25)) if with_source else velocity
 
 
 @pytest.mark.parametrize("power", [1.0, 0.5])

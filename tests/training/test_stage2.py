@@ -26,7 +26,7 @@ from dior_rt.training.stage2 import (
     fit_stage2,
     load_scenes,
     real_pair,
-    with_own_strokes,
+    with_estimated_strokes,
 )
 
 OPS = NumpyOps()
@@ -138,7 +138,7 @@ def test_real_pairs_are_driven_by_the_light_that_the_model_sees_in_their_target(
     pairs, renders, steps
 ) -> None:
     (batch,) = islice(mixed(pairs, renders), 1)
-    drawn = with_own_strokes(Oracle(), batch, steps, shift=8.0)
+    drawn = with_estimated_strokes(Oracle(), batch, steps, shift=8.0)
     target = batch["photo"] + batch["x0"] / RELIT_SCALE
     light = 2 * srgb_to_linear(target)
     shares = []
@@ -176,7 +176,7 @@ def unseen(stage1, pairs, renders, tmp_path_factory):
     (batch,) = islice(mixed(pairs, renders, start=900), 1)
     backbone = MiniLora(stage1, 1, tmp_path_factory.mktemp("unused"))
     noise = torch.randn(batch["x0"].shape, generator=torch.Generator().manual_seed(0))
-    return with_own_strokes(backbone, batch, 1, shift=8.0), noise
+    return with_estimated_strokes(backbone, batch, 1, shift=8.0), noise
 
 
 def losses_of(network: torch.nn.Module, unseen) -> list[float]:

@@ -52,7 +52,7 @@ class Model:
             self.relighter.relight(photo, strokes, self.options, reach=self.settings.reach).picture
         )
 
-    def estimate(self, photo: Photo) -> Raster:
+    def estimate(self, photo: Photo | Raster) -> Raster:
         """The photo's own light on the light grid, (h, w, 3) linear."""
         return self.relighter.estimate(photo, self.options)
 

@@ -2,7 +2,7 @@
 
 from dior_rt.training.network.checkpoint import LORA, WEIGHTS, load_network, save_network
 from dior_rt.training.network.config import Config
-from dior_rt.training.network.features import BOUNCED, Features, Given
+from dior_rt.training.network.features import BOUNCED, Features, InputChannels
 from dior_rt.training.network.layers import LARGEST_LOGIT, Block, Rotation, rotate, rotations
 from dior_rt.training.network.model import Mini, velocity
 
@@ -14,7 +14,7 @@ __all__ = [
     "Block",
     "Config",
     "Features",
-    "Given",
+    "InputChannels",
     "Mini",
     "Rotation",
     "load_network",

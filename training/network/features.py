@@ -29,7 +29,7 @@ FADE: Final = 3.0
 HALF_FADE: Final = 0.15
 
 
-class Given(NamedTuple):
+class InputChannels(NamedTuple):
     """The 21 channels that the head needs at every step, three each, (B, 3, h, w)."""
 
     photo: Tensor  # sRGB-encoded
@@ -41,7 +41,7 @@ class Given(NamedTuple):
     everywhere: Tensor  # the same over the whole picture
 
     @classmethod
-    def from_channels(cls, channels: Tensor) -> Given:
+    def from_channels(cls, channels: Tensor) -> InputChannels:
         """Split (B, 21, h, w)."""
         return cls(*channels.split(RGB, dim=1))
 
@@ -53,7 +53,7 @@ class Given(NamedTuple):
 class Features(NamedTuple):
     """The features of photo and strokes. The field names are those of the exported graphs."""
 
-    given: Tensor  # (B, 21, h, w), see Given
+    given: Tensor  # (B, 21, h, w), see InputChannels
     fine: Tensor  # (B, fine, h, w)
     half: Tensor  # (B, half, h / 2, w / 2)
     quarter: Tensor  # (B, quarter, h / 4, w / 4)
@@ -75,18 +75,18 @@ def seen_channels(photo: Tensor, light: Tensor, mask: Tensor, linear: Tensor, pa
     return torch.cat([2 * photo - 1, encode_lumi(light) * mask, *spreads], dim=1)
 
 
-def given_channels(
+def input_channels(
     photo: Tensor, light: Tensor, mask: Tensor, linear: Tensor, source_lumi: Tensor, patch: int
-) -> Given:
+) -> InputChannels:
     """Return what the head needs at every step; source_lumi: the light on the photo, encoded."""
     # Under a stroke the light is known: twice the value is twice the light, before anything is learnt.
     brightness = torch.exp(source_lumi.clamp(0.0, BRIGHTEST) * math.log1p(LUMI_SCALE))  # 1 + 8 L
     ratio = mask * (_log_light(light) - torch.log(brightness - (1 - LUMI_SCALE * BOUNCED)))
-    return Given(photo, linear, encode_lumi(linear), *ratio_beside_strokes(ratio, mask, patch))
+    return InputChannels(photo, linear, encode_lumi(linear), *ratio_beside_strokes(ratio, mask, patch))
 
 
 def ratio_beside_strokes(ratio: Tensor, mask: Tensor, patch: int) -> list[Tensor]:
-    """Return the last four fields of Given from the log-ratio (B, 3, h, w) under the mask (B, 1, h, w)."""
+    """Return the last four InputChannels, given the log-ratio (B, 3, h, w) under the mask (B, 1, h, w)."""
     beside, strokes = 1 - mask, torch.cat([ratio, mask], dim=1)  # (B, 4, h, w)
     faded, share = around(strokes, FADE).split((RGB, MASK), dim=1)
     under = ratio + beside * (faded / (share + HALF_FADE))

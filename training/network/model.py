@@ -25,7 +25,7 @@ from torch.nn import functional as F
 
 from dior_rt.training.light import RELIT_SCALE, apply_log_ratio, linear_to_srgb, srgb_to_linear
 from dior_rt.training.network.config import ANSWER, MODES, MODULATIONS, RGB, SEEN, Config
-from dior_rt.training.network.features import Features, Given, given_channels, seen_channels
+from dior_rt.training.network.features import Features, InputChannels, input_channels, seen_channels
 from dior_rt.training.network.layers import (
     Blend,
     Block,
@@ -40,8 +40,8 @@ from dior_rt.training.network.layers import (
 
 #: Gates are sigmoid(answer - CLOSED), so they begin an eighth open.
 CLOSED: Final = 2.0
-#: With noise 1 / MURK times as strong as the image, half of the state is hidden from the network.
-MURK: Final = 0.1
+#: With noise 1 / HIDING_RATIO times as strong as the image, half of the state is hidden from the network.
+HIDING_RATIO: Final = 0.1
 #: Deviation of x0 from the network's answer: about 0.12 in sRGB.
 DEVIATION: Final = 0.5
 #: The largest log-ratio, reached smoothly: 400 times the light, or a 400th.
@@ -93,17 +93,17 @@ class Mini(nn.Module):
         mask: Tensor,
         mode: Tensor,
         own: Tensor | None = None,
-        with_own: bool = False,
+        with_source: bool = False,
     ) -> Tensor | tuple[Tensor, Tensor]:
-        """Return the velocity; with `with_own` also the encoded source Lumi map.
+        """Return the velocity; with `with_source` also the encoded source Lumi map.
 
         own: that map, if it is known from an earlier call.
         """
-        own = self.own_light(photo) if own is None else own
+        own = self.estimate_source(photo) if own is None else own
         result = self.step(x, sigma, mode, *self.encode(photo, light, mask, own))
-        return (result, own) if with_own else result
+        return (result, own) if with_source else result
 
-    def own_light(self, photo: Tensor) -> Tensor:
+    def estimate_source(self, photo: Tensor) -> Tensor:
         """Return the encoded source Lumi map (B, 3, h, w), estimated without strokes from a state of zeros.
 
         If the network saw the strokes, the estimate would lean towards them, because drawn light tends to be
@@ -120,7 +120,7 @@ class Mini(nn.Module):
         half = F.silu(self.see_half(fine))  # (B, half, h / 2, w / 2)
         quarter = self.refine(F.silu(self.see_quarter(half)))  # (B, quarter, h / 4, w / 4)
         tokens = self.embed(quarter)  # (B, width, h / patch, w / patch)
-        given = given_channels(photo, light, mask, linear, own, patch)
+        given = input_channels(photo, light, mask, linear, own, patch)
         cosine, sine = self._rotation(tokens)
         return Features(given.to_channels(), fine, half, quarter, tokens, cosine, sine)
 
@@ -157,7 +157,7 @@ class Mini(nn.Module):
         gated = self.see_state(state) * self.state_gate(condition)[: x.shape[0], :, None, None]
         cells = F.silu(self.smooth(cells + features.fine + gated))
         raw, own, gates = self.mix(self.head(cells).float()).split(RGB, dim=1)  # (B, 3, h, w) each
-        given = Given.from_channels(features.given)
+        given = InputChannels.from_channels(features.given)
         near, far, wide = torch.sigmoid(gates - CLOSED).split(1, dim=1)  # (B, 1, h, w) each
         ratio = raw + given.under_strokes
         ratio = ratio + near * given.nearby + far * given.farther + wide * given.everywhere
@@ -206,7 +206,7 @@ def state_visibility(sigma: Tensor) -> Tensor:
     Near noise the state says nothing about the photo; it holds only a faint copy of the network's earlier
     answers, and the network must not take these for evidence.
     """
-    image, noise = (1 - sigma) ** 2, (MURK * sigma) ** 2
+    image, noise = (1 - sigma) ** 2, (HIDING_RATIO * sigma) ** 2
     return image / (image + noise)
 
 

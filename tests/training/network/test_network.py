@@ -124,10 +124,10 @@ def test_every_input_matters_but_light_that_is_not_specified(awake) -> None:
 @torch.no_grad()
 def test_the_photo_s_own_light_does_not_depend_on_strokes_state_or_time(awake) -> None:
     given, other = inputs(), inputs(seed=1)
-    own = awake(**given, with_own=True)[1]
+    own = awake(**given, with_source=True)[1]
     for changed in ({**other, "photo": given["photo"]}, {**given, "light": 16 * given["light"]}):
-        torch.testing.assert_close(awake(**changed, with_own=True)[1], own, atol=0, rtol=0)
-    assert not torch.equal(awake(**other, with_own=True)[1], own)
+        torch.testing.assert_close(awake(**changed, with_source=True)[1], own, atol=0, rtol=0)
+    assert not torch.equal(awake(**other, with_source=True)[1], own)
     torch.testing.assert_close(awake(**given, own=own), awake(**given), atol=0, rtol=0)
 
 

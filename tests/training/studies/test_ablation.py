@@ -138,7 +138,7 @@ def test_rows_are_judged_by_the_same_pictures(maps, tmp_path) -> None:
             view = View.load(path)
             images = view.images if kind == LUMI else view.images[..., ::-1]
             replace(view, images=images).save(tmp_path / kind / path.name)
-    with pytest.raises(InputError, match="not of the same pictures"):
+    with pytest.raises(InputError, match="show different pictures"):
         judge({Condition("other", "phong"): Unmoved()}, tmp_path)
     with pytest.raises(InputError, match="train maps"):
         judge({Condition("none", "shading"): Unmoved()}, tmp_path)
