@@ -97,8 +97,8 @@ def fit(
     """Train on the shards in `packs`; the folder `out` receives the state in parts and resumes from it.
 
     sizes: of a new network. start: the checkpoint of another run to go on from instead, with a new schedule.
-    backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new materials. Raises
-    InputError for files that cannot be used, and where training diverges.
+    backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new materials.
+    Raises InputError for files that cannot be used, and where training diverges.
     """
     make_folder(out)
     torch.manual_seed(config.seed)
