@@ -92,6 +92,7 @@ def test_picture_on_every_device(relighter, ops, expected, hold, case):
     hold(f"{case}: picture", ops.name.split()[0], picture, expected[case], CODES["fp32"], "1/255")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("precision", ["fp16", "int8"])
 def test_picture_in_every_precision(relighter, expected, hold, precision, case):

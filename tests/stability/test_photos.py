@@ -234,7 +234,9 @@ def test_every_kind_of_photo(relighter, ops, expected, hold, tmp_path, kind):
 
 
 @pytest.mark.parametrize("precision", ["fp16", "int8"])
-@pytest.mark.parametrize("kind", CONTENTS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] if "4000" in kind else []) for kind in CONTENTS]
+)
 def test_every_content_in_every_precision(relighter, expected, hold, tmp_path, kind, precision):
     case = CONTENTS[kind]
     got = relight_file(relighter(precision, "numpy"), case, tmp_path)
