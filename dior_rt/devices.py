@@ -8,7 +8,8 @@ from dior_rt.bundle import Bundle
 from dior_rt.engine import open_engine
 from dior_rt.errors import DiorError
 from dior_rt.kernels import KernelError, check_device, list_devices, open_ops
-from dior_rt.providers import PROVIDERS, available
+from dior_rt.plugins import PACKAGES, is_installed
+from dior_rt.providers import PROVIDERS, available, is_built_in
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,12 @@ def survey_network(bundle: Bundle) -> Survey:
             problem = None
         except DiorError as error:
             problem = str(error)
-        devices.append(Device(name, f"ONNX Runtime, {PROVIDERS[name].ort_name}", problem))
+        kind = "" if is_built_in(name) else " (plug-in)"
+        devices.append(Device(name, f"ONNX Runtime, {PROVIDERS[name].ort_name}{kind}", problem))
+    for name in PACKAGES:
+        if is_installed(name) and name not in available():
+            problem = "its package is installed and finds no hardware that it can use"
+            devices.append(Device(name, f"ONNX Runtime, {PROVIDERS[name].ort_name} (plug-in)", problem))
     engine = open_engine(bundle, graph, "auto")
     return Survey(tuple(devices), Choice(engine.device, engine.reason))
 

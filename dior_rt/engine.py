@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -54,14 +55,26 @@ class Engine:
         self.device = device
         self.reason = reason or f"{device} was asked for"
         self._session = open_session(model, device, threads, keep)
-        self.inputs = tuple(map(_tensor, self._session.get_inputs()))
-        self.outputs = tuple(map(_tensor, self._session.get_outputs()))
+        self._process = os.getpid()
+        try:
+            self.inputs = tuple(map(_tensor, self._session.get_inputs()))
+            self.outputs = tuple(map(_tensor, self._session.get_outputs()))
+        except UnicodeDecodeError as error:
+            raise BundleError(f"Cannot use {model}: a tensor's name in it is no text.") from error
         # Only the CPU's provider promises to run one session from several threads at once.
         self._lock = contextlib.nullcontext() if device == "cpu" else threading.Lock()
 
     def bind(self, constants: Feeds) -> Binding:
         """Put inputs that stay the same over many runs onto the device, once."""
         return Binding(self, constants)
+
+    def check_process(self) -> None:
+        """Raise DeviceError in a fork of the process that loaded the graph: its threads are not there."""
+        if os.getpid() != self._process:
+            raise DeviceError(
+                "This model was loaded before the process was forked, and its threads were not copied: load "
+                "it in each process, or start processes by the method 'spawn'."
+            )
 
     def run(self, feeds: Feeds) -> dict[str, NDArray]:
         """Run the graph once: {input name: array} -> {output name: array}. Raises as `Binding.run` does."""
@@ -72,6 +85,7 @@ class Binding:
     """An engine with some of its inputs in place. Belongs to one thread."""
 
     def __init__(self, engine: Engine, constants: Feeds) -> None:
+        engine.check_process()
         self._engine = engine
         self._constants = {name: np.asarray(array, order="C") for name, array in constants.items()}
         check_feeds(tuple(tensor for tensor in engine.inputs if tensor.name in constants), constants)
@@ -88,6 +102,7 @@ class Binding:
         and DeviceError where the device fails or computes what is no number.
         """
         engine = self._engine
+        engine.check_process()
         feeds = {name: np.asarray(array, order="C") for name, array in feeds.items()}
         check_feeds(engine.inputs, {**self._constants, **feeds})
         with translated(engine.device), engine._lock:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -18,12 +20,18 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
     Raises InputError, with the reason, where the folder cannot be written or the disk is full.
     """
-    target = path.resolve()  # through a symbolic link, so that the link stays one
-    draft = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}")
+    try:
+        target = path.resolve()  # through a symbolic link, so that the link stays one
+        # A short name of its own: the target's may be as long as names can be. Not tempfile: its files are
+        # private to the user, ours gets the permissions of any new file, or of the one that it replaces.
+        draft = target.with_name(f".{secrets.token_hex(8)}.part")
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"Cannot write {path}: {reason(error)}.") from error
     try:
         try:
-            # Not tempfile: its files are private to the user, ours gets the permissions of any new file.
             with draft.open("xb") as file:
+                with contextlib.suppress(OSError):
+                    draft.chmod(stat.S_IMODE(target.stat().st_mode))
                 yield file
             draft.replace(target)
         except OSError as error:
@@ -31,6 +39,14 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     finally:
         with contextlib.suppress(OSError):
             draft.unlink()
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove what `replacing` left in a folder where its process was killed."""
+    with contextlib.suppress(OSError):
+        for draft in folder.glob(".*.part"):
+            if re.fullmatch(r"\.[0-9a-f]{16}\.part", draft.name):
+                draft.unlink()
 
 
 def make_folder(path: Path) -> None:
@@ -44,33 +60,56 @@ def make_folder(path: Path) -> None:
 def check_writable(path: Path) -> None:
     """Raise InputError now if `replacing(path)` would fail later, as far as can be known."""
     try:
-        if path.is_dir():
-            raise IsADirectoryError("it is a folder; name a file")
-        if path.exists() and not path.is_file():
-            raise OSError("it is not a regular file")
-        if path.exists() and not os.access(path, os.W_OK):
-            raise PermissionError("it is write-protected")
-        if not path.resolve().parent.is_dir():
-            raise NotADirectoryError(f"the folder {path.parent} does not exist")
-        probe = path.resolve().with_name(f".{secrets.token_hex(8)}")
+        target = path.resolve()
+        if not target.parent.is_dir():
+            through = f", to which {path.name} links," if path.is_symlink() else ""
+            raise NotADirectoryError(f"the folder {_shown(target, path)}{through} does not exist")
+        with contextlib.suppress(FileNotFoundError):
+            mode = path.stat().st_mode
+            if stat.S_ISDIR(mode):
+                raise IsADirectoryError("it is a folder; name a file")
+            if not stat.S_ISREG(mode):
+                raise OSError("it is not a regular file")
+            if not os.access(path, os.W_OK):
+                raise PermissionError("it is write-protected")
+        probe = target.with_name(f".{secrets.token_hex(8)}")
         probe.open("xb").close()
         probe.unlink()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {reason(error)}.") from error
+
+
+def check_free(path: Path, overwrite: bool) -> None:
+    """Raise InputError where a file is there already, unless it may be replaced."""
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} is there already. Give --overwrite to replace it, or name another file.")
+
+
+def _shown(target: Path, path: Path) -> Path:
+    return target.parent if path.is_symlink() else path.parent
 
 
 def check_readable(path: Path, what: str) -> None:
     """Raise InputError unless `path` is a regular file that can be opened. what: "photo", "strokes" ..."""
     try:
-        if path.is_dir():
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
             raise IsADirectoryError("it is a folder")
-        if path.exists() and not path.is_file():
+        if not stat.S_ISREG(mode):
             raise OSError("it is not a regular file")
         path.open("rb").close()
     except FileNotFoundError as error:
         raise InputError(f"Cannot read the {what} {path}: there is no such file.") from error
     except (OSError, ValueError) as error:
         raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
+
+
+def is_same_file(one: Path, other: Path) -> bool:
+    """Whether two paths lead to one file; False where one of them leads nowhere or cannot be followed."""
+    try:
+        return one.samefile(other)
+    except (OSError, ValueError):
+        return False
 
 
 def reason(error: BaseException) -> str:

@@ -16,10 +16,16 @@ from onnxruntime.capi import onnxruntime_pybind11_state as ort_state
 
 from dior_rt.errors import BundleError, DeviceError, InputError
 from dior_rt.files import reason
+from dior_rt.plugins import plugin_devices
+
+with contextlib.suppress(Exception):  # the builds for Windows, which report to the system itself
+    ort.disable_telemetry_events()
 
 _ORT_ERRORS: tuple[type[Exception], ...] = (
     RuntimeError,
     ValueError,
+    TypeError,
+    OSError,
     *(kind for kind in vars(ort_state).values() if isinstance(kind, type) and issubclass(kind, Exception)),
 )
 
@@ -51,15 +57,26 @@ PROVIDERS = {
 
 
 def available() -> list[str]:
-    """The names of the providers that the installed ONNX Runtime was built with; "cpu" is the last."""
+    """The names of the providers that are built in or plugged in and find hardware; "cpu" is the last."""
     built = ort.get_available_providers()
-    return [name for name, provider in PROVIDERS.items() if provider.ort_name in built]
+    return [
+        name for name, provider in PROVIDERS.items() if provider.ort_name in built or plugin_devices(name)
+    ]
 
 
 def accelerators() -> list[str]:
     """The devices that "auto" tries before the CPU, best first."""
     choices = {name: PROVIDERS[name].accelerator for name in available() if name != "cpu"}
-    return [f"{name}:{choice}" if choice else name for name, choice in choices.items()]
+    return [
+        f"{name}:{choice}" if choice else name
+        for name, choice in choices.items()
+        if is_built_in(name) or plugin_devices(name, choice)
+    ]
+
+
+def is_built_in(name: str) -> bool:
+    """Whether the installed ONNX Runtime was built with a provider; else it may be plugged in."""
+    return PROVIDERS[name].ort_name in ort.get_available_providers()
 
 
 def open_session(model: Path, device: str, threads: int | None, keep: bool = True) -> ort.InferenceSession:
@@ -76,10 +93,16 @@ def open_session(model: Path, device: str, threads: int | None, keep: bool = Tru
         raise DeviceError(f"There is no device {device!r} here; there is {', '.join(available())}, or auto.")
     provider, cpu = PROVIDERS[name], PROVIDERS["cpu"]
     options = {**provider.options, **({provider.choice: choice} if choice else {})}
+    session_options = _session_options(name, threads, keep)
+    providers: dict[str, Mapping[str, str]] = {provider.ort_name: options, cpu.ort_name: {}}
+    if not is_built_in(name):
+        devices = plugin_devices(name, choice)
+        if not devices:
+            raise DeviceError(f"{name} finds no device {choice!r} here.")
+        session_options.add_provider_for_devices(devices, {})
+        providers = {}
     try:
-        session = _start(
-            model, {provider.ort_name: options, cpu.ort_name: {}}, _session_options(name, threads, keep)
-        )
+        session = _start(model, providers, session_options)
     except _ORT_ERRORS as error:
         # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
         kind = BundleError if name == "cpu" else DeviceError
@@ -114,6 +137,15 @@ def _session_options(name: str, threads: int | None, keep: bool) -> ort.SessionO
     return options
 
 
+def _readable(model: Path) -> str | bytes:
+    """The path as ONNX Runtime takes it: as text, or the file's content where the path is no text."""
+    try:
+        str(model).encode()
+    except UnicodeEncodeError:
+        return model.read_bytes()
+    return str(model)
+
+
 def _start(
     model: Path, providers: Mapping[str, Mapping[str, str]], options: ort.SessionOptions
 ) -> ort.InferenceSession:
@@ -121,6 +153,8 @@ def _start(
         4
     )  # what fails is raised or seen by the caller; no log on the terminal too
     try:
-        return ort.InferenceSession(str(model), options, providers=list(providers.items()), enable_fallback=0)
+        return ort.InferenceSession(
+            _readable(model), options, providers=list(providers.items()) or None, enable_fallback=0
+        )
     finally:
         ort.set_default_logger_severity(2)

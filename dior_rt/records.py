@@ -24,7 +24,9 @@ def read_json(path: Path, most_bytes: int) -> Any:
     if len(data) > most_bytes:
         raise ValueError(f"it is longer than {most_bytes} bytes")
     try:
-        return json.loads(data.decode(), object_pairs_hook=_unique, parse_constant=_no_constant)
+        # Windows' shells write UTF-16, or UTF-8 with a mark; the standard lets a reader take both.
+        text = data.decode(json.detect_encoding(data))
+        return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except RecursionError:
         raise ValueError("it is nested too deep") from None
 

@@ -12,14 +12,23 @@ from typing import Any, Unpack
 
 import numpy as np
 
+from dior_rt import __version__
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
 from dior_rt.families import open_family
 from dior_rt.flow.adaptive import sample_within
 from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.flow.schedule import ShiftSchedule
-from dior_rt.images.arrays import Picture, check_same_shape, like_photo, read_pixels, read_strokes
+from dior_rt.images.arrays import (
+    Picture,
+    check_same_shape,
+    in_primaries_of,
+    like_photo,
+    read_pixels,
+    read_strokes,
+)
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
+from dior_rt.kernels.types import STRONGEST
 from dior_rt.light import decode_small
 from dior_rt.presets import ALWAYS, REFERENCE, read_presets
 from dior_rt.reach import check_reach, within_reach
@@ -64,6 +73,11 @@ class Relit:
     def guidance(self) -> float:
         """The scale that was used."""
         return self.sampling.guidance
+
+    def facts(self) -> dict[str, Any]:
+        """What decided the result, for its metadata."""
+        used = {"steps": self.steps, "seed": self.seed, "intensity": self.intensity, "reach": self.reach}
+        return {**self.sampling.facts(), **used}
 
 
 class Relighter:
@@ -112,9 +126,24 @@ class Relighter:
         return self._ops.reason
 
     @property
+    def ops_notice(self) -> str:
+        """What the user should know of that choice, such as a driver that crashes; "" for nothing."""
+        return self._ops.notice
+
+    @property
     def presets(self) -> tuple[str, ...]:
         """The names that `relight` takes as its preset. Raises BundleError."""
         return REFERENCE, *read_presets(self.bundle)
+
+    def facts(self) -> dict[str, Any]:
+        """What makes its results, for their metadata. The manifest's hash covers those of all files."""
+        return {
+            "version": __version__,
+            "bundle": self.bundle.manifest.name,
+            "bundle_sha256": self.bundle.sha256,
+            "device": self.device,
+            "ops": self.ops,
+        }
 
     @_device_errors()
     def relight(
@@ -131,7 +160,8 @@ class Relighter:
     ) -> Relit:
         """Return the photo under the light of the strokes.
 
-        photo: sRGB, a Pillow image or an array (H, W, 3) of uint8, uint16, or float32 in 0..1.
+        photo: a Pillow image, which is read as its file would be (upright by its EXIF, in the colours of its
+          profile); or an array (H, W, 3), sRGB, of uint8, uint16, or float32 in 0..1.
         strokes: one of
           - Strokes, or RGBA as a Pillow image or an array (H, W, 4), shaped like the photo or like its light
             grid, of any size; alpha 0 = unspecified, integers are sRGB-encoded and floats linear;
@@ -154,9 +184,11 @@ class Relighter:
         watch = Stopwatch()
         pixels = read_pixels(photo)
         raster = self._family.raster(*pixels.shape[:2])
-        drawn = self._reduce_strokes(strokes, pixels.shape[:2], raster, intensity)
+        drawn = self._reduce_strokes(in_primaries_of(photo, strokes), pixels.shape[:2], raster, intensity)
         if not drawn.mask.any():
-            return Relit(photo.copy(), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
+            return Relit(
+                like_photo(pixels.copy(), photo), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach
+            )
         source, encoded = self._family.reduce_photo(pixels, raster, self._ops)
         watch.lap("kernels")
         condition = self._family.encode(encoded, drawn, "relight")
@@ -205,9 +237,10 @@ class Relighter:
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
         drawn = self._ops.reduce_strokes(light, mask, raster)
-        with np.errstate(over="ignore", invalid="ignore"):
-            drawn = Strokes(drawn.light * np.float32(intensity), drawn.mask)
-        if not np.isfinite(drawn.light).all():
+        # In float64, which holds the product of any strokes and any intensity that is allowed.
+        light = drawn.light.astype(np.float64) * intensity
+        drawn = Strokes(light.clip(max=STRONGEST).astype(np.float32), drawn.mask)
+        if not light.max() <= STRONGEST:
             raise InputError("The strokes' light is too strong to be computed with; lower the intensity.")
         return drawn
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, TypedDict
 
@@ -10,6 +9,10 @@ from dior_rt.bundle import Bundle
 from dior_rt.errors import InputError
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.presets import REFERENCE, Preset, read_presets
+
+#: The largest guidance and noise scale: far beyond any use, and float32 still holds what the network makes
+#: of it.
+MOST_SCALE: Final = 1000.0
 
 
 @dataclass(frozen=True)
@@ -77,8 +80,8 @@ class Sampling(Preset):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, value in (("guidance", self.guidance), ("noise_scale", self.noise_scale)):
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} must be a number of at least 0, not {value}")
+            if not 0 <= value <= MOST_SCALE:
+                raise ValueError(f"{name} must lie between 0 and {MOST_SCALE:g}, not {value:g}")
         if self.tolerance is not None and not 0 < self.tolerance < 1:
             raise ValueError(f"tolerance must lie between 0 and 1, not {self.tolerance}")
 

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
 import numpy as np
 
 from dior_rt.kernels import draw
@@ -14,6 +19,7 @@ from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
 #: Pixels in a band, so that a band stays in the processor's cache.
 BAND = 1 << 16
+MOST_THREADS = 16
 
 
 class NumpyOps(Ops):
@@ -40,9 +46,18 @@ class NumpyOps(Ops):
         height, width = picture.shape[:2]
         down, across = area_weights(height, grid[0]), area_weights(width, grid[1])
         total = np.zeros((grid[0], width * 3), np.float32)
-        for rows in bands(height, width, BAND):
+        parts = list(bands(height, width, BAND))
+        sums: dict[int, tuple[Any, FloatArray]] = {}
+
+        def work(rows: slice) -> None:
             cells = down[:, rows].any(1)
-            total[cells] += down[cells, rows] @ self._decode(picture[rows]).reshape(-1, width * 3)
+            light = self._decode(picture[rows]).reshape(-1, width * 3)
+            sums[rows.start] = cells, down[cells, rows] @ light
+
+        each(work, parts)
+        for rows in parts:  # in their order, so that every run adds up to the same bits
+            cells, light = sums[rows.start]
+            total[cells] += light
         return across @ total.reshape(grid[0], width, 3)
 
     def _reduce_strokes(self, light: Picture, mask: Picture, grid: Grid) -> Strokes:
@@ -59,13 +74,7 @@ class NumpyOps(Ops):
         return Strokes(value, (weight[..., 0] > 0).astype(np.float32))
 
     def _draw_strokes(self, strokes: list[Stroke], size: Grid) -> Strokes:
-        height, width = size
-        light, mask = np.zeros((height, width, 3), np.float32), np.zeros(size, np.float32)
-        for rows in bands(height, width, BAND):
-            for stroke in strokes:
-                _lay_over(light[rows], mask[rows], stroke, rows.start, size)
-        np.divide(light, mask[..., None], out=light, where=mask[..., None] > 0)
-        return Strokes(light, mask)
+        return draw.paint(strokes, size)
 
     def _coarsen(self, lumi: FloatArray, lattice: Lattice) -> Strokes:
         height, width = lumi.shape[:2]
@@ -95,7 +104,8 @@ class NumpyOps(Ops):
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
         # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane per quantity.
         near_columns = [np.ascontiguousarray(np.moveaxis(nodes[:, column + m], 2, 0)) for m in range(3)]
-        for rows in bands(height, width, BAND):
+
+        def work(rows: slice) -> None:
             lightness = np.clip(photo[rows] @ (LIGHTNESS / np.float32(whole)), 0, 1) / np.float32(SIGMA)
             total = np.zeros((4, *lightness.shape), np.float32)
             for k, m in np.ndindex(3, 3):
@@ -108,7 +118,20 @@ class NumpyOps(Ops):
             linear = self._decode(photo[rows])
             relit = linear + (linear + np.float32(EPSILON)) * (q * (q + 2))
             result[rows] = self._encode(relit, photo.dtype)
+
+        each(work, list(bands(height, width, BAND)))
         return result
+
+
+def each(work: Callable[[slice], None], parts: list[slice]) -> None:
+    """Do the work on every part, on as many threads as there are cores: NumPy lets others run meanwhile."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if min(cores, len(parts)) < 2:
+        for part in parts:
+            work(part)
+        return
+    with ThreadPoolExecutor(min(cores, len(parts), MOST_THREADS)) as pool:
+        list(pool.map(work, parts))
 
 
 def _weighted(light: Picture, mask: Picture) -> FloatArray:
@@ -118,33 +141,3 @@ def _weighted(light: Picture, mask: Picture) -> FloatArray:
     linear = light if light.dtype == np.float32 else decode_table(light.dtype)[light]
     weight = np.where(mask > 0, np.maximum(mask, np.float32(FAINTEST)), 0)[..., None]
     return np.concatenate([np.where(weight > 0, linear, np.float32(0)) * weight, weight], 2)
-
-
-def _lay_over(light: FloatArray, mask: FloatArray, stroke: Stroke, top: int, size: Grid) -> None:
-    """Blend one stroke over a band that starts at row `top`. light holds value * mask."""
-    ends, margin = draw.segments(stroke, size), draw.radius(stroke) + 1
-    if len(ends) == 0:
-        return
-    box = _window(ends.reshape(-1, 2), margin, top, mask.shape)
-    nearest = np.full(mask[box].shape, np.inf, np.float32)
-    if nearest.size == 0:
-        return
-    for segment in ends:
-        y, x = _window(segment.reshape(-1, 2), margin, top, mask.shape)
-        middle_y = np.arange(y.start, y.stop, dtype=np.float32)[:, None] + np.float32(top + 0.5)
-        middle_x = np.arange(x.start, x.stop, dtype=np.float32) + np.float32(0.5)
-        here = nearest[
-            y.start - box[0].start : y.stop - box[0].start, x.start - box[1].start : x.stop - box[1].start
-        ]
-        np.minimum(here, draw.distance_squared(segment, middle_x, middle_y), out=here)
-    cover = draw.coverage(stroke, np.sqrt(nearest))
-    light[box] += cover[..., None] * (np.array(stroke.light, np.float32) - light[box])
-    mask[box] += cover * (1 - mask[box])
-
-
-def _window(points: FloatArray, margin: float, top: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Return the rows and columns of a band that are within `margin` of the bounding box of points (x, y)."""
-    low = np.floor(points.min(0) - margin) - (0, top)
-    high = np.ceil(points.max(0) + margin) - (0, top)
-    (left, above), (right, below) = (np.clip(edge, 0, shape[::-1]).astype(int) for edge in (low, high))
-    return slice(above, below), slice(left, right)

@@ -25,11 +25,13 @@ class Ops(ABC):
     float32 and linear; 1.0 is display white. Arrays need not be contiguous. Results are contiguous and
     always new.
 
-    name: the device that computes. reason: why it was chosen, in one sentence.
+    name: the device that computes. reason: why it was chosen, in one sentence. notice: what the user should
+    know of the choice, one sentence or "".
     """
 
     name: str
     reason: str = "it was requested"
+    notice: str = ""
 
     def decode_srgb(self, picture: Picture) -> FloatArray:
         """Convert sRGB to linear, any shape. Floats outside 0..1 follow the extended curve; NaN stays NaN."""

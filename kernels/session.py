@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -53,6 +54,7 @@ class Session:
             self._shares_memory = bool(device.handle.host_unified_memory)
         except cl.Error as error:
             raise KernelError(f"{self.name} cannot be opened ({error})") from error
+        self._process = os.getpid()
         self._run = CPU_RUN if device.type == "cpu" else 1
         self._lock, self._local = threading.Lock(), threading.local()
         self._programs: dict[tuple[str, ...], cl.Program] = {}
@@ -62,9 +64,13 @@ class Session:
     def kernel(self, name: str, **defines: object) -> cl.Kernel:
         """Return the kernel of that name, from the program built with -Dkey=value for each of `defines`.
 
-        All sources make one program, because a build costs a quarter of a second, and more sources hardly
-        add to it.
-        """
+        All sources make one program, for a build costs a quarter of a second and more sources hardly
+        anything."""
+        if os.getpid() != self._process:
+            raise KernelError(
+                f"{self.name} was opened before the process was forked, and its driver's threads were not "
+                "copied: start processes by the method 'spawn'"
+            )
         options = tuple(f"-D{key}={value}" for key, value in defines.items())
         with self._lock:
             program = self._programs.get(options)

@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 #: In pixels: farther points and wider strokes are refused.
 FARTHEST = 1e9
+#: Times display white: stronger light is refused, since products of it leave float32's range.
+STRONGEST = 1e9
 
 FloatArray = npt.NDArray[np.float32]
 Picture = npt.NDArray[Any]  # uint8, uint16 or float32
@@ -55,6 +57,8 @@ class Stroke:
             raise ValueError(f"a stroke's width must lie between 0 and {FARTHEST:g} pixels, not {self.width}")
         if len(self.color) != 3 or not all(math.isfinite(c) and c >= 0 for c in self.light):
             raise ValueError("a stroke's color must be three finite numbers >= 0, and its intensity one")
+        if max(self.light) > STRONGEST:
+            raise ValueError(f"a stroke's color times its intensity must be at most {STRONGEST:g}")
         if not 0 <= self.softness <= 1:
             raise ValueError(f"a stroke's softness must lie in 0..1, not {self.softness}")
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -14,9 +13,12 @@ def _share(text: str) -> float:
     """A number, or a fraction such as 0.5/255."""
     above, bar, below = text.partition("/")
     try:
-        return float(Fraction(above) / Fraction(below if bar else 1))
-    except (ValueError, ZeroDivisionError, OverflowError):
-        raise typer.BadParameter(f"{text!r} is no number and no fraction such as 0.5/255.") from None
+        share = float(above) / (float(below) if bar else 1)
+    except (ValueError, ZeroDivisionError):
+        share = math.nan
+    if not math.isfinite(share):
+        raise typer.BadParameter(f"{text[:40]!r} is no number and no fraction such as 0.5/255.")
+    return share
 
 
 def _finite(value: float | None) -> float | None:
@@ -25,7 +27,7 @@ def _finite(value: float | None) -> float | None:
     return value
 
 
-Photo = Annotated[Path, typer.Argument(metavar="PHOTO", help="A PNG, JPEG, TIFF or WebP picture.")]
+Photo = Annotated[Path, typer.Argument(metavar="PHOTO", help="A PNG, JPEG, TIFF or WebP picture ...")]
 Bundle = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="The model [default: the one that ships with dior-rt].")
 ]
@@ -83,6 +85,30 @@ Reach = Annotated[
         help="How far from the strokes light changes, as a share of the photo's longer side; 0.1 paints one "
         "lamp and leaves the rest [default: as far as the model takes it].",
     ),
+]
+Format = Annotated[
+    Literal["png", "jpg", "tif", "webp", "exr", "jxl"] | None,
+    typer.Option(
+        help="The kind of file to write [default: by the name of OUT, else png, tif for camera raw, or exr "
+        "for EXR]."
+    ),
+]
+Quality = Annotated[
+    int | None,
+    typer.Option(min=1, max=100, help="Of JPEG, WebP and JPEG XL [default: 95; JPEG XL keeps every pixel]."),
+]
+Bits = Annotated[
+    Literal["8", "16", "32"] | None,
+    typer.Option(help="Bits a channel; 16 also computes in 16 [default: as the photo has them]."),
+]
+Sidecar = Annotated[
+    bool, typer.Option("--sidecar", help="Write how the picture was made into an .xmp file beside it.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a result that is there already.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Page = Annotated[
+    int,
+    typer.Option(min=0, max=999, help="Which page of STROKES is read where it has several; 0 is the first."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object that says what was done.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from dior_rt.errors import InputError
-from dior_rt.kernels import Strokes
+from dior_rt.images.photo import image_of, photo_of
+from dior_rt.images.primaries import Matrix, conversion, convert, srgb
+from dior_rt.kernels import NumpyOps, Stroke, Strokes
 
 Picture = Image.Image | NDArray
 
@@ -20,10 +26,13 @@ SHAPE_TOLERANCE = (
 
 
 def read_pixels(photo: Picture) -> NDArray:
-    """The photo's (H, W, 3) pixels, sRGB, without alpha. Raises InputError."""
+    """The photo's (H, W, 3) pixels, upright and on the sRGB curve, without alpha. Raises InputError.
+
+    A Pillow image is read as its file would be: by its EXIF orientation and its colour profile.
+    """
     if isinstance(photo, Image.Image):
         _check_8_bit(photo)
-        return np.asarray(photo.convert("RGB"))
+        return photo_of(photo).pixels
     pixels = np.asarray(photo)
     _check_array("a photo", pixels, channels=3)
     if pixels.dtype == np.float32 and not (pixels.min() >= 0 and pixels.max() <= BRIGHTEST):
@@ -33,13 +42,49 @@ def read_pixels(photo: Picture) -> NDArray:
 
 def like_photo(pixels: NDArray, photo: Picture) -> Picture:
     """The pixels as the photo's kind: a Pillow image gets the photo's alpha, and its ICC and EXIF data."""
-    if not isinstance(photo, Image.Image):
-        return pixels
-    picture = Image.fromarray(pixels)
-    if photo.has_transparency_data:
-        picture.putalpha(photo.convert("RGBA").getchannel("A"))
-    picture.info = {key: photo.info[key] for key in ("icc_profile", "exif") if key in photo.info}
-    return picture
+    return image_of(photo_of(photo), pixels) if isinstance(photo, Image.Image) else pixels
+
+
+def in_primaries_of(photo: Picture, strokes: Any) -> Any:
+    """Strokes of any kind with their light in the primaries of a photo, which a Pillow image may name.
+
+    Arrays, Strokes and Stroke have those of sRGB; a Pillow image of strokes has its own profile's.
+    """
+    target = photo_of(photo).primaries if isinstance(photo, Image.Image) else srgb()
+    if isinstance(strokes, Image.Image):
+        _check_8_bit(strokes)
+        return convert_raster(_read_rgba(strokes), conversion(photo_of(strokes).primaries, target))
+    matrix = conversion(srgb(), target)
+    if matrix is None:
+        return strokes
+    if isinstance(strokes, Strokes):
+        light = np.where(strokes.mask[..., None] > 0, strokes.light, 0)
+        return Strokes(convert(light.astype(np.float32), matrix), strokes.mask)
+    if isinstance(strokes, Sequence):
+        return convert_strokes(strokes, matrix)
+    return convert_raster(_read_rgba(strokes), matrix)
+
+
+def convert_strokes(strokes: Sequence[Stroke], matrix: Matrix | None) -> list[Stroke]:
+    """Strokes whose light is converted by a matrix of `primaries.conversion`."""
+    if matrix is None:
+        return list(strokes)
+    converted = []
+    for stroke in strokes:
+        red, green, blue = convert(np.array(stroke.color, np.float64), matrix).tolist()
+        converted.append(replace(stroke, color=(red, green, blue)))
+    return converted
+
+
+def convert_raster(raster: NDArray, matrix: Matrix | None) -> NDArray:
+    """(H, W, 4) light and mask, whose light is converted; it is float32 and linear then."""
+    if matrix is None:
+        return raster
+    light, mask = raster[..., :3], raster[..., 3]
+    if light.dtype != np.float32:
+        mask = mask / np.float32(np.iinfo(mask.dtype).max)
+        light = NumpyOps().decode_srgb(light)
+    return np.dstack([convert(np.where(mask[..., None] > 0, light, 0), matrix), mask]).astype(np.float32)
 
 
 def read_strokes(strokes: Strokes | Picture) -> tuple[NDArray, NDArray]:
@@ -81,7 +126,12 @@ def _read_rgba(picture: Picture) -> NDArray:
     _check_8_bit(picture)
     if not picture.has_transparency_data:
         raise InputError("The strokes have no alpha channel to say where light was drawn.")
-    return np.asarray(picture.convert("RGBA"))
+    photo = photo_of(picture)
+    assert photo.alpha is not None  # it has transparency
+    alpha = photo.alpha.astype(photo.pixels.dtype)
+    if alpha.dtype != photo.alpha.dtype:
+        alpha *= alpha.dtype.type(257)
+    return np.dstack([photo.pixels, alpha])
 
 
 def _check_8_bit(picture: Image.Image) -> None:

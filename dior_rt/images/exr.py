@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,28 @@ from numpy.typing import NDArray
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, reason, replacing
 from dior_rt.images.photo import MOST_PIXELS
+from dior_rt.images.primaries import Matrix, srgb, to_xyz
+
+
+@dataclass(frozen=True)
+class ExrPicture:
+    """pixels: (H, W, 3 or 4) float32. primaries: of its RGB, as `primaries.to_xyz`."""
+
+    pixels: NDArray[np.float32]
+    primaries: Matrix
 
 
 def read_exr(path: Path, what: str) -> NDArray[np.float32]:
     """The channels R, G, B and, where there is one, A of the first part as (H, W, 3 or 4) float32, unchanged.
 
     The picture is the display window; what the data window leaves open is 0. what: how errors call the file.
-    Raises InputError for a file that is damaged, of more than MOST_PIXELS, or without those channels.
+    Raises InputError for a file that is damaged, deep, of more than MOST_PIXELS, or without those channels.
     """
+    return read_exr_picture(path, what).pixels
+
+
+def read_exr_picture(path: Path, what: str) -> ExrPicture:
+    """As `read_exr`, with the primaries that the header names; Rec. 709's where it names none."""
     import OpenEXR
 
     check_readable(path, what)
@@ -30,6 +45,8 @@ def read_exr(path: Path, what: str) -> NDArray[np.float32]:
         with _hushed():
             # The header first: a few bytes can promise a picture of any size.
             header = OpenEXR.File(str(path), header_only=True).header()
+            if header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
+                raise ValueError("it is a deep EXR, with many samples a pixel; flatten it first")
             shown, stored = _box(header["displayWindow"]), _box(header["dataWindow"])
             if not all(0 < width * height <= MOST_PIXELS for _, _, width, height in (shown, stored)):
                 raise ValueError(f"it is empty, or has more than {MOST_PIXELS // 10**6} megapixels")
@@ -38,19 +55,33 @@ def read_exr(path: Path, what: str) -> NDArray[np.float32]:
                 raise ValueError("it has no channels R, G and B")
             planes = [channels[name].pixels for name in "RGBA" if name in channels]
         data = np.stack(planes, axis=-1).astype(np.float32, copy=False)
-        return data if shown == stored else _frame(data, shown, stored)
+        pixels = data if shown == stored else _frame(data, shown, stored)
+        return ExrPicture(pixels, _primaries(header))
     except (OSError, RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
         raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
 
 
-def write_exr(path: Path, light: NDArray[np.float32]) -> None:
-    """Write (H, W, 3) linear light as float32 channels R, G and B, whole or not at all. Raises InputError."""
+def _primaries(header: dict[str, Any]) -> Matrix:
+    given = header.get("chromaticities")
+    if given is None:
+        return srgb()
+    rx, ry, gx, gy, bx, by, wx, wy = (float(value) for value in given)
+    return to_xyz((rx, ry, gx, gy, bx, by, wx, wy))
+
+
+def write_exr(path: Path, light: NDArray[Any], texts: Mapping[str, str] | None = None) -> None:
+    """Write (H, W, 3 or 4) linear light, float32 or float16, as R, G, B and A, whole or not at all.
+
+    The colours of a picture with A are multiplied by it, as EXR has it. texts: attributes of the
+    header. Raises InputError.
+    """
     import OpenEXR
 
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(texts or {})}
+    name = "RGB" if light.shape[2] == 3 else "RGBA"
     with replacing(path) as file, _hushed():
         try:
-            OpenEXR.File(header, {"RGB": np.ascontiguousarray(light)}).write(file.name)
+            OpenEXR.File(header, {name: np.ascontiguousarray(light)}).write(file.name)
         except RuntimeError as error:
             raise InputError(f"Cannot write {path}: {reason(error)}.") from error
 

@@ -41,6 +41,11 @@ class Curves:
         codes = np.linspace(0, 1, self.srgb.shape[1])
         return bool(np.abs(self.srgb - codes).max() <= 0.5 / 255)
 
+    def with_codes(self, codes: int) -> Curves:
+        """The same curves at another number of codes, by straight lines."""
+        x = np.linspace(0, 1, self.srgb.shape[1])
+        return Curves(np.stack([np.interp(np.linspace(0, 1, codes), x, row) for row in self.srgb]))
+
     def to_srgb(self, pixels: Pixels) -> NDArray[np.uint16]:
         """(H, W, channels) in the photo's own encoding -> uint16, sRGB-encoded."""
         tables = np.round(self.srgb * 65535).astype(np.uint16)
@@ -92,6 +97,19 @@ def interpret(samples: Pixels, icc: bytes) -> Coloured:
     if curves.is_srgb:
         return Coloured(samples, icc=icc)
     return Coloured(curves.to_srgb(samples), curves, icc)
+
+
+def read_primaries(icc: bytes) -> NDArray[np.float64] | None:
+    """(3, 3) linear RGB -> XYZ under D50 of an RGB profile made of primaries and curves; else None."""
+    try:
+        tags = _tags(icc)
+        if icc[16:20] != b"RGB " or b"A2B0" in tags:
+            return None
+        columns = [struct.unpack_from(">3i", tags[name], 8) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]
+    except (ValueError, KeyError, struct.error):
+        return None
+    matrix = np.array(columns, np.float64).T / 65536
+    return matrix if abs(np.linalg.det(matrix)) > 1e-6 else None
 
 
 def convert_to_srgb(image: Image.Image, icc: bytes) -> Image.Image:

@@ -1,14 +1,17 @@
-"""What a picture says about itself: EXIF carried over from the photo, and the settings that made the result.
+"""What a picture says about itself: EXIF, XMP and IPTC carried over, and the settings that made the result.
 
-Of EXIF is kept what stays true of the relit photo. Left out are the orientation (carried out), sizes and
-thumbnail (stale), and the maker's note (its inner offsets break when it is moved).
+EXIF keeps what stays true of the relit photo. Left out are the orientation (carried out), sizes and thumbnail
+(stale), and the maker's note (its inner offsets break when it is moved). The settings stand in XMP, and in a
+PNG also as text; the photographer's own UserComment is left alone.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import struct
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,56 +20,123 @@ from PIL.ExifTags import IFD, Base
 
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable
+from dior_rt.images import xmp
+from dior_rt.images.directories import HEADER, UNDEFINED, Directory, Entry, Reader, number, pack
 
 #: What a damaged file makes Pillow raise, here and there.
-DAMAGE = (OSError, ValueError, SyntaxError, EOFError, ArithmeticError, LookupError, TypeError, AttributeError)
+DAMAGE = (
+    OSError,
+    ValueError,
+    SyntaxError,
+    EOFError,
+    ArithmeticError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+    struct.error,
+)
 
 KEY = "Dior"
 
-_KEPT = (
-    *(
-        Base.ImageDescription,
-        Base.Make,
-        Base.Model,
-        Base.Software,
-        Base.DateTime,
-        Base.Artist,
-        Base.HostComputer,
-    ),
-    *(
-        Base.Copyright,
-        Base.Rating,
-        Base.XPTitle,
-        Base.XPComment,
-        Base.XPAuthor,
-        Base.XPKeywords,
-        Base.XPSubject,
-    ),
-)
-_STALE = (Base.MakerNote, Base.ExifInteroperabilityOffset, Base.ExifImageWidth, Base.ExifImageHeight)
-_ASCII = b"ASCII\0\0\0"  # the character code that opens a UserComment
+IPTC = 0x0404  # the number of IPTC's block among Photoshop's resources
+IPTC_TAG, XMP_TAG = 33723, 700  # of TIFF
+
+_KEPT = {
+    Base.ImageDescription,
+    Base.Make,
+    Base.Model,
+    Base.Software,
+    Base.DateTime,
+    Base.Artist,
+    Base.HostComputer,
+    Base.Copyright,
+    Base.Rating,
+    Base.XPTitle,
+    Base.XPComment,
+    Base.XPAuthor,
+    Base.XPKeywords,
+    Base.XPSubject,
+}
+_STALE = {Base.MakerNote, Base.ExifInteroperabilityOffset, Base.ExifImageWidth, Base.ExifImageHeight}
+#: Tags that EXIF defines as UNDEFINED, but some programs (Pillow among them) write as BYTE.
+_UNDEFINED = {36864, 37121, 37500, 37510, 40960, 41728, 41729, 41730, 27, 28}
+_UNCALIBRATED = 65535
+_HEAD = b"Exif\0\0"
 
 
-def keep_exif(exif: Image.Exif) -> bytes:
-    """The part of a photo's EXIF that its relit twin keeps; b"" for none. Raises one of DAMAGE."""
-    kept = Image.Exif()
-    for tag in _KEPT:
-        if tag in exif:
-            kept[tag] = exif[tag]
-    camera = {tag: value for tag, value in exif.get_ifd(IFD.Exif).items() if tag not in _STALE}
-    for ifd, values in ((IFD.Exif, camera), (IFD.GPSInfo, exif.get_ifd(IFD.GPSInfo))):
-        if values:
-            kept.get_ifd(ifd).update(values)
-    written = kept.tobytes()
-    return written if any(True for _ in kept) or camera or exif.get_ifd(IFD.GPSInfo) else b""
+@dataclass(frozen=True)
+class Exif:
+    """A picture's EXIF by directory. damaged: whether a part of it could not be read."""
+
+    main: Directory = field(default_factory=dict)
+    camera: Directory = field(default_factory=dict)
+    place: Directory = field(default_factory=dict)
+    interoperability: Directory = field(default_factory=dict)
+    damaged: bool = False
+
+    @property
+    def orientation(self) -> int:
+        """1 to 8, as the picture must be turned to stand upright; 1 where nothing sensible is said."""
+        value = number(self.main, Base.Orientation, 1)
+        return int(value) if value in range(1, 9) else 1
+
+    @property
+    def is_adobe_rgb(self) -> bool:
+        """Whether the camera says Adobe RGB by DCF's mark "R03", the only one that has no ICC profile."""
+        space = number(self.camera, Base.ColorSpace, _UNCALIBRATED)
+        mark = self.interoperability.get(1)
+        return space == _UNCALIBRATED and mark is not None and mark.text() == "R03"
+
+    def kept(self) -> bytes:
+        """The part that stays true of the relit photo, as it is written; b"" for none."""
+        main = {tag: value for tag, value in self.main.items() if tag in _KEPT}
+        camera = {tag: _typed(tag, value) for tag, value in self.camera.items() if tag not in _STALE}
+        place = {tag: _typed(tag, value) for tag, value in self.place.items()}
+        if not (main or camera or place):
+            return b""
+        return _HEAD + HEADER + pack(main, {IFD.Exif: camera, IFD.GPSInfo: place})
 
 
-def stamp(exif: bytes, settings: Mapping[str, Any]) -> Image.Exif:
-    """EXIF with the settings as JSON {"Dior": {...}} in its UserComment."""
-    stamped = Image.Exif()
-    stamped.load(exif)
-    stamped.get_ifd(IFD.Exif)[Base.UserComment] = _ASCII + json.dumps({KEY: settings}).encode()
-    return stamped
+def read_exif(data: bytes) -> Exif:
+    """EXIF from the bytes that a JPEG, PNG, WebP or AVIF holds; damaged parts are left out."""
+    if not data:
+        return Exif()
+    try:
+        return exif_of(Reader(data.removeprefix(_HEAD)))
+    except (ValueError, struct.error):
+        return Exif(damaged=True)
+
+
+def exif_of(reader: Reader, offset: int | None = None) -> Exif:
+    """EXIF from the directory at an offset, the first one where none is named."""
+    main, _ = reader.directory(reader.first if offset is None else offset)
+    found = []
+    for directory, pointer in ((main, IFD.Exif), (main, IFD.GPSInfo)):
+        at = int(number(directory, pointer))
+        found.append(reader.directory(at)[0] if at else {})
+    camera, place = found
+    at = int(number(camera, Base.ExifInteroperabilityOffset))
+    interoperability = reader.directory(at)[0] if at else {}
+    return Exif(main, camera, place, interoperability, reader.damaged)
+
+
+def directories_of(exif: bytes) -> tuple[Directory, dict[int, Directory]]:
+    """Written EXIF as a TIFF takes it: the main directory, and the others by the tag that points at them."""
+    parts = read_exif(exif)
+    main = {tag: value for tag, value in parts.main.items() if tag not in (IFD.Exif, IFD.GPSInfo)}
+    return main, {IFD.Exif: parts.camera, IFD.GPSInfo: parts.place}
+
+
+def _typed(tag: int, value: Entry) -> Entry:
+    return Entry(UNDEFINED, value.count, value.data) if tag in _UNDEFINED and value.kind == 1 else value
+
+
+def photoshop_block(iptc: bytes) -> bytes:
+    """The JPEG segment (APP13) that holds IPTC."""
+    block = b"8BIM" + struct.pack(">HHI", IPTC, 0, len(iptc)) + iptc + bytes(len(iptc) % 2)
+    data = b"Photoshop 3.0\0" + block
+    return b"\xff\xed" + struct.pack(">H", len(data) + 2) + data
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -74,12 +144,13 @@ def read_settings(path: Path) -> dict[str, Any]:
     check_readable(path, "picture")
     try:
         with Image.open(path) as image:
-            if image.format == "PNG":
-                image.load()
-                return json.loads(image.info[KEY])
-            comment = image.getexif().get_ifd(IFD.Exif)[Base.UserComment]
-            return json.loads(comment.removeprefix(_ASCII))[KEY]
-    except DAMAGE as error:
+            image.load()
+            text = image.info.get(KEY) or xmp.read_settings(image.info["xmp"])
+            settings = json.loads(text)
+            if not isinstance(settings, dict):
+                raise ValueError
+            return settings
+    except (*DAMAGE, MemoryError) as error:
         raise InputError(f"{path} does not say how it was made.") from error
 
 

@@ -1,15 +1,18 @@
 """Photos in and out of files: orientation, depth, colour, transparency and metadata survive the way through.
 
-In: PNG, JPEG (MPO too), TIFF, WebP, GIF, BMP, JPEG 2000, AVIF and PPM. Out: PNG, JPEG, TIFF and WebP, by the
-file's suffix. The orientation that EXIF asks for is carried out; the rest of EXIF is kept (see `metadata`).
-16-bit grey and RGB stay 16-bit (see `deep`). An RGB profile is kept with its primaries and honoured in its
-curve (see `profiles`); other colour spaces become 8-bit sRGB. JPEG and WebP hold 8 bits, so a 16-bit photo is
+In: PNG, JPEG (MPO too), TIFF, WebP, GIF, BMP, JPEG 2000, AVIF, PPM and flat Photoshop documents, and what
+`readers` adds: EXR, HEIC, JPEG XL and camera raw. Out: PNG, JPEG, TIFF, WebP, EXR and JPEG XL, by the file's
+suffix. The orientation that EXIF asks for is carried out; the rest of EXIF is kept (see `metadata`).
+16-bit grey and RGB stay 16-bit (see `sixteen_bit`). An RGB profile is kept with its primaries and honoured in
+its curve (see `icc`); what PNG, AVIF and EXIF say of colour in other ways becomes such a profile
+(`primaries`); other colour spaces become 8-bit sRGB. JPEG and WebP hold 8 bits, so a 16-bit photo is
 rounded when it is written as such.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 import warnings
 import zlib
@@ -21,20 +24,55 @@ from typing import IO, Any
 
 import numpy as np
 from PIL import Image, ImageFile, PngImagePlugin, TiffImagePlugin, UnidentifiedImageError
-from PIL.ExifTags import IFD, Base
-from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, check_writable, reason, replacing
-from dior_rt.images.icc import Coloured, Curves, Pixels, convert_to_srgb, interpret, srgb_profile
-from dior_rt.images.metadata import DAMAGE, KEY, keep_exif, read_dpi, stamp
+from dior_rt.images import xmp
+from dior_rt.images.camera_raw import RAW, is_raw
+from dior_rt.images.containers import facts_of, read_facts
+from dior_rt.images.directories import BYTE, RATIONAL, SHORT, UNDEFINED, entry
+from dior_rt.images.encoding import BITS, PLAIN, Encoding
+from dior_rt.images.icc import (
+    Coloured,
+    Curves,
+    Pixels,
+    convert_to_srgb,
+    interpret,
+    read_primaries,
+    srgb_profile,
+)
+from dior_rt.images.metadata import (
+    DAMAGE,
+    IPTC_TAG,
+    KEY,
+    XMP_TAG,
+    directories_of,
+    photoshop_block,
+    read_dpi,
+)
+from dior_rt.images.netpbm import is_deep_netpbm, read_netpbm
+from dior_rt.images.png_chunks import raw_profile
+from dior_rt.images.primaries import Matrix, conversion, srgb
+from dior_rt.images.readers import MissingReader, find_reader
 from dior_rt.images.sixteen_bit import STRATEGY, is_deep, read_deep, write_png, write_tiff
+from dior_rt.images.tiff_pages import read_facts as read_tiff_facts
 
 #: Larger pictures are refused by their header, before they are decoded; Pillow, as it comes, agrees.
 MOST_PIXELS = 178_956_970
 
-_READABLE = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "JPEG2000", "AVIF", "PPM")
-_WRITABLE = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}
+_READABLE = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "JPEG2000", "AVIF", "PPM", "PSD")
+_WRITABLE = {
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WEBP",
+    ".exr": "EXR",
+    ".jxl": "JXL",
+}
+_TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_JPEG_SEGMENT = 65533
 _LONGEST = {"JPEG": 65500, "WEBP": 16383}
 _SAVE: dict[str, dict[str, Any]] = {
     "JPEG": {"quality": 95, "subsampling": 0},
@@ -57,10 +95,13 @@ _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 class Photo:
     """A photo as it is seen, upright.
 
-    pixels: (H, W, 3) uint8 or uint16 on the sRGB curve, in the photo's own primaries. alpha: (H, W) of the
+    pixels: (H, W, 3) uint8 or uint16 on the sRGB curve, in the photo's own primaries; or float32 on that
+    curve, continued above 1 (see `exr_photo`). alpha: (H, W) of the
     file's depth, or None. curves: what the pixels are taken back to when written, where that is not sRGB's
-    curve. icc, exif: as they are written, b"" for none. dpi: dots an inch across and down, or None. notices:
-    sentences about what could not be kept.
+    curve. icc, exif, xmp, iptc: as they are written, b"" for none. dpi: dots an inch across and down, or
+    None. notices: sentences about what could not be kept. offset, canvas: where a cut-out picture lies,
+    (right, down) on a canvas of (rows, columns), None where the file does not say. lossy: whether packing
+    changed the pixels.
     """
 
     pixels: Pixels
@@ -70,6 +111,18 @@ class Photo:
     exif: bytes = b""
     dpi: tuple[float, float] | None = None
     notices: tuple[str, ...] = ()
+    xmp: bytes = b""
+    iptc: bytes = b""
+    offset: tuple[int, int] = (0, 0)
+    canvas: tuple[int, int] | None = None
+    lossy: bool = False
+    pages: int = 1
+
+    @property
+    def primaries(self) -> Matrix:
+        """(3, 3): what red, green and blue stand for; those of sRGB where no profile says otherwise."""
+        found = read_primaries(self.icc) if self.icc else None
+        return srgb() if found is None else found
 
     @property
     def size(self) -> tuple[int, int]:
@@ -78,41 +131,70 @@ class Photo:
 
     @property
     def bits(self) -> int:
-        """8 or 16 a channel: the depth of the file, and of a file that keeps all of it."""
+        """8, 16 or 32 a channel: the depth of the file, and of a file that keeps all of it."""
+        if self.pixels.dtype == np.float32:
+            return 32
         codes = self.curves.srgb.shape[1] if self.curves else np.iinfo(self.pixels.dtype).max + 1
         return 8 if codes == 256 else 16
+
+    def with_bits(self, bits: int | None) -> Photo:
+        """The same photo with 16 bits a channel where it has 8 and more are asked for, so that its light is
+        computed in them."""
+        if bits != 16 or self.bits != 8:
+            return self
+        wide = self.pixels if self.pixels.dtype == np.uint16 else self.pixels * np.uint16(257)
+        alpha = None if self.alpha is None else self.alpha * np.uint16(257)
+        return replace(self, pixels=wide, alpha=alpha, curves=self.curves and self.curves.with_codes(65536))
 
     def with_pixels(self, pixels: Pixels) -> Photo:
         """The same photo with other pixels of the same shape and dtype."""
         return replace(self, pixels=pixels)
 
 
-def read_photo(path: Path, what: str = "photo") -> Photo:
-    """Read a photo; what: how an error calls it.
+def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
+    """Read a photo; what: how an error calls it; page: which one, where a file has several, 0 the first.
 
     Raises InputError for a file that is missing, damaged, cut short, of more than MOST_PIXELS, or of a kind
-    that cannot be kept whole (floating point, 32-bit integers).
+    that cannot be kept whole (camera raw, HDR, floating point, 32-bit integers).
     """
     check_readable(path, what)
     cause: BaseException
+    reader = None
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's doubts about EXIF and size; both are dealt with here
-            return _read(file)
+            if what == "photo" and (reader := find_reader(file.read(64), path.suffix)):
+                return reader.load()(path)
+            file.seek(0)
+            return _read(file, page)
+    except InputError:
+        raise
     except UnidentifiedImageError as error:
         cause, problem = error, _kind_of(path)
     except Image.DecompressionBombError as error:
         cause, problem = error, f"it has more than {MOST_PIXELS // 10**6} megapixels"
     except MemoryError as error:
         cause, problem = error, "it does not fit into memory"
+    except MissingReader as error:
+        cause, problem = error, str(error)
     except DAMAGE as error:
         cause, problem = error, reason(error)
+        if reader:
+            problem = f"it is {reader.kind} that is damaged or of an unknown kind ({problem})"
     raise InputError(f"Cannot read the {what} {path}: {problem}.") from cause
 
 
-def check_output(path: Path, photo: Photo) -> None:
-    """Raise InputError where `write_photo(path, photo)` would fail: to be known before the work is done."""
+def check_output(path: Path, photo: Photo, encoding: Encoding = PLAIN) -> None:
+    """Raise InputError where `write_photo` would fail: to be known before the work is done."""
     form = _form(path)
+    if problem := encoding.problem(form):
+        raise InputError(f"Cannot write {path}: {problem}.")
+    if form == "EXR" and photo.icc and conversion(photo.primaries, srgb()) is not None:
+        raise InputError(
+            f"Cannot write {path}: EXR cannot keep the photo's colour profile; name a .tif file."
+        )
+    if form == "JXL":
+        _jxl_writer(path)
     if form == "JPEG" and _is_transparent(photo):
         raise InputError(f"Cannot write {path}: JPEG cannot hold the photo's transparency; name a .png file.")
     if max(photo.size) > _LONGEST.get(form, max(photo.size)):
@@ -122,62 +204,125 @@ def check_output(path: Path, photo: Photo) -> None:
     check_writable(path)
 
 
-def write_photo(path: Path, photo: Photo, settings: Mapping[str, Any]) -> None:
+def write_photo(
+    path: Path,
+    photo: Photo,
+    settings: Mapping[str, Any],
+    encoding: Encoding = PLAIN,
+    *,
+    generated: bool = True,
+) -> tuple[str, ...]:
     """Write a photo whole or not at all, with the settings that made it as JSON in its metadata.
 
-    They stand in a PNG's iTXt chunk "Dior", elsewhere in EXIF's UserComment as {"Dior": {...}}. Raises
-    InputError where the file cannot be written.
+    They stand in XMP, and in a PNG also in the iTXt chunk "Dior". generated: whether XMP says that a model
+    had a hand in the picture. Returns sentences about what the format cannot hold. Raises InputError where
+    the file cannot be written.
     """
     form = _form(path)
-    samples = _samples(photo, form)
+    if form == "EXR":
+        return _write_exr(path, photo, settings, encoding)
+    samples = _samples(photo, form, encoding.bits)
+    packet, iptc, notices = _metadata(photo, form, settings, generated)
+    if photo.pixels.dtype == np.float32 and (photo.pixels > 1).any():
+        notices = (*notices, f"{form} ends at display white; name an .exr file to keep brighter light.")
+    if form == "JXL":
+        return (*notices, *_write_jxl(path, samples, photo, encoding))
+    quality = {} if encoding.quality is None else {"quality": encoding.quality}
     with replacing(path) as file:
         try:
             if form == "PNG":
-                _write_png(file, samples, photo, settings)
+                _write_png(file, samples, photo, settings, packet, iptc)
             elif form == "TIFF":
-                write_tiff(file, samples, _tiff_tags(photo, settings))
+                _write_tiff(file, samples, photo, packet, iptc)
             else:
-                exif = stamp(photo.exif, settings).tobytes()
-                _save(file, samples, photo, exif, format=form, **_SAVE[form])
-        except (ValueError, TypeError, ArithmeticError, MemoryError) as error:
+                more: dict[str, Any] = {"extra": photoshop_block(iptc)} if iptc else {}
+                _save(file, samples, photo, format=form, xmp=packet, **more, **(_SAVE[form] | quality))
+        except (ValueError, TypeError, ArithmeticError, MemoryError, struct.error) as error:
             raise InputError(f"Cannot write {path}: {reason(error)}.") from error
+    return notices
 
 
-def _read(file: IO[bytes]) -> Photo:
+def _read(file: IO[bytes], page: int) -> Photo:
+    head = file.read(1024)
+    if is_raw(head):
+        raise ValueError(RAW)
+    if head[:4] in _TIFF_HEADS:
+        _refuse_unreadable_tiff(file, page)
+
     def open_image() -> ImageFile.ImageFile:
         file.seek(0)
-        return Image.open(file, formats=_READABLE)
+        opened = Image.open(file, formats=_READABLE)
+        if page:
+            opened.seek(page)
+        opened.info.pop("xmp", None)  # by which Pillow would turn a TIFF; only EXIF's orientation counts
+        return opened
 
-    image = open_image()
+    file.seek(0)
+    image = Image.open(file, formats=_READABLE)
     if image.width * image.height > MOST_PIXELS:
         raise Image.DecompressionBombError
-    notices = []
-    if image.format != "MPO" and getattr(image, "is_animated", False):
-        notices.append("It has more than one frame; the first is used.")
-    # Pillow finds a TIFF's EXIF in the open file, and a PNG's perhaps after the pixels.
-    exif = image.getexif() if image.format != "PNG" else None
-    if is_deep(image):
-        alpha, coloured = _interpret_deep(read_deep(open_image), image.info)
+    pages = 1 if image.format in ("MPO", "PSD") else getattr(image, "n_frames", 1)
+    if page >= pages:
+        raise ValueError(f"it has no page {page}; its pages are 0 to {pages - 1}")
+    if page:
+        image.seek(page)
+    facts = read_facts(file, image, page)
+    if image.format == "PSD":
+        notices = ["It is a Photoshop document; its flat picture is read, without layers."]
+    elif pages > 1:
+        notices = [f"It has {pages} pages; page {page}{', the first,' * (not page)} is read."]
+    else:
+        notices = []
+    if _has_gain_map(image):
+        notices.append("It has an HDR gain map, which belongs to the photo's old light; it is left out.")
+    notices += facts.notices
+    image = open_image()
+    if is_deep_netpbm(head):
+        alpha, coloured = None, interpret(read_netpbm(file), facts.icc)
+    elif is_deep(image):
+        alpha, coloured = _interpret_deep(read_deep(open_image), image.info, facts.icc)
     else:
         _refuse_unknown_depth(image)
         image.load()
-        alpha, coloured = _interpret_image(image)
-    exif = exif or image.getexif()
-    try:
-        kept = keep_exif(exif)
-    except DAMAGE:
-        kept = b""
-        notices.append("Its EXIF data is damaged; it is left out.")
+        alpha, coloured = interpret_image(image, facts.icc)
+    if facts.bits:
+        notices.append(
+            f"It has {facts.bits} bits a channel, of which 8 are read; a 16-bit PNG or TIFF keeps them."
+        )
+    if facts.exif.damaged:
+        notices.append("A part of its EXIF data is damaged; that part is left out.")
+    xmp_kept = facts.xmp if facts.xmp and xmp.is_sound(facts.xmp) else b""
+    if facts.xmp and not xmp_kept:
+        notices.append("Its XMP data is damaged or too long; it is left out.")
     photo = Photo(
         coloured.pixels,
         alpha,
         coloured.curves,
         coloured.icc,
-        kept,
+        facts.exif.kept(),
         read_dpi(image.info),
         (*notices, *coloured.notices),
+        xmp_kept,
+        facts.iptc,
+        facts.offset,
+        facts.canvas,
+        facts.lossy,
+        pages,
     )
-    return _upright(photo, exif.get(Base.Orientation, 1))
+    orientation = facts.exif.orientation
+    if facts.turned:
+        return replace(photo, dpi=_turned_dpi(photo.dpi, orientation))
+    return upright(photo, orientation)
+
+
+def _refuse_unreadable_tiff(file: IO[bytes], page: int) -> None:
+    facts = read_tiff_facts(file, page)
+    if facts.is_raw:
+        raise ValueError(RAW)
+    if facts.depth:
+        raise ValueError(
+            f"it has {facts.depth}; save it as a 16-bit RGB PNG or TIFF (light of any strength: as EXR)"
+        )
 
 
 def _refuse_unknown_depth(image: Image.Image) -> None:
@@ -189,9 +334,8 @@ def _refuse_unknown_depth(image: Image.Image) -> None:
         raise ValueError("its 16-bit samples are stored in an unusual way; save it as a 16-bit PNG")
 
 
-def _interpret_image(image: Image.Image) -> tuple[Pixels | None, Coloured]:
+def interpret_image(image: Image.Image, icc: bytes) -> tuple[Pixels | None, Coloured]:
     """(alpha, colours) of a decoded 8-bit picture of any mode."""
-    icc = image.info.get("icc_profile") or b""
     if image.mode == "CMYK":
         if icc[16:20] != b"CMYK":
             return None, Coloured(np.asarray(image.convert("RGB")))
@@ -206,22 +350,53 @@ def _interpret_image(image: Image.Image) -> tuple[Pixels | None, Coloured]:
     return None, interpret(samples, icc)
 
 
-def _interpret_deep(samples: np.ndarray, info: Mapping[Any, Any]) -> tuple[Pixels | None, Coloured]:
+def _interpret_deep(
+    samples: np.ndarray, info: Mapping[Any, Any], icc: bytes
+) -> tuple[Pixels | None, Coloured]:
     """(alpha, colours) of (H, W, 1..4) 16-bit samples."""
     alpha = None
     if samples.shape[-1] in (2, 4):
         samples, alpha = samples[..., :-1], samples[..., -1]
     elif (key := info.get("transparency")) is not None:  # one colour stands for "nothing here"
         alpha = np.where((samples == np.asarray(key)).all(axis=-1), 0, 65535).astype(np.uint16)
-    return alpha, interpret(samples, info.get("icc_profile") or b"")
+    return alpha, interpret(samples, icc)
 
 
-def _upright(photo: Photo, orientation: int) -> Photo:
+def photo_of(image: Image.Image) -> Photo:
+    """A Pillow image of 8 bits as `read_photo` would read its file. Raises InputError."""
+    try:
+        image.load()
+        facts = facts_of(image)
+        alpha, coloured = interpret_image(image, facts.icc)
+    except (*DAMAGE, MemoryError) as error:
+        raise InputError(f"The image cannot be used: {reason(error)}.") from error
+    photo = Photo(
+        coloured.pixels, alpha, coloured.curves, coloured.icc, facts.exif.kept(), read_dpi(image.info)
+    )
+    return photo if facts.turned else upright(photo, facts.exif.orientation)
+
+
+def image_of(photo: Photo, pixels: Pixels) -> Image.Image:
+    """A Pillow image of 8 bits: other pixels in the photo's own encoding, with its alpha and metadata."""
+    image = Image.fromarray(_samples(photo.with_pixels(pixels), "WEBP"))
+    image.info = {name: value for name, value in _info(photo).items() if value}
+    return image
+
+
+def _info(photo: Photo) -> dict[str, Any]:
+    return {"dpi": photo.dpi, "icc_profile": photo.icc, "exif": photo.exif}
+
+
+def upright(photo: Photo, orientation: int) -> Photo:
+    """The photo turned as EXIF's orientation asks."""
     turn = _UPRIGHT.get(orientation, lambda a: a)
     pixels = np.ascontiguousarray(turn(photo.pixels))
     alpha = None if photo.alpha is None else np.ascontiguousarray(turn(photo.alpha))
-    dpi = photo.dpi[::-1] if photo.dpi and orientation in (5, 6, 7, 8) else photo.dpi
-    return replace(photo, pixels=pixels, alpha=alpha, dpi=dpi)
+    return replace(photo, pixels=pixels, alpha=alpha, dpi=_turned_dpi(photo.dpi, orientation))
+
+
+def _turned_dpi(dpi: tuple[float, float] | None, orientation: int) -> tuple[float, float] | None:
+    return dpi[::-1] if dpi and orientation in (5, 6, 7, 8) else dpi
 
 
 def _form(path: Path) -> str:
@@ -234,9 +409,9 @@ def _is_transparent(photo: Photo) -> bool:
     return photo.alpha is not None and bool(photo.alpha.min() < np.iinfo(photo.alpha.dtype).max)
 
 
-def _samples(photo: Photo, form: str) -> Pixels:
+def _samples(photo: Photo, form: str, bits: int | None = None) -> Pixels:
     """(H, W, 3 or 4) in the photo's own encoding, at the depth that the file will have."""
-    bits = photo.bits if form in ("PNG", "TIFF") else 8
+    bits = bits or (min(photo.bits, 16) if 16 in BITS[form] else 8)
     pixels = photo.curves.from_srgb(photo.pixels) if photo.curves else photo.pixels
     pixels = _to_depth(pixels, bits)
     if photo.alpha is None or form == "JPEG":
@@ -245,45 +420,110 @@ def _samples(photo: Photo, form: str) -> Pixels:
 
 
 def _to_depth(samples: Pixels, bits: int) -> Pixels:
+    if samples.dtype == np.float32:
+        top = (1 << bits) - 1
+        return np.round(np.clip(samples, 0, 1) * np.float32(top)).astype(np.uint8 if bits == 8 else np.uint16)
+    if samples.dtype == np.uint8 and bits == 16:
+        return samples * np.uint16(257)
     if samples.dtype == np.uint16 and bits == 8:
         return np.round(samples / 257).astype(np.uint8)
     return samples
 
 
-def _save(file: IO[bytes], samples: Pixels, photo: Photo, exif: bytes, **options: Any) -> None:
-    optional: dict[str, Any] = {"dpi": photo.dpi, "icc_profile": photo.icc, "exif": exif}
-    given = {name: value for name, value in optional.items() if value}
+def _metadata(
+    photo: Photo, form: str, settings: Mapping[str, Any], generated: bool
+) -> tuple[bytes, bytes, tuple[str, ...]]:
+    """XMP and IPTC as the format holds them, and sentences about what it does not hold."""
+    text, iptc, notices = json.dumps(settings), photo.iptc, []
+    packet = xmp.merge(photo.xmp, text, generated)
+    if form == "JPEG" and len(packet) > _JPEG_SEGMENT - 29:
+        notices.append("JPEG cannot hold XMP data of this length; the photo's own is left out.")
+        packet = xmp.merge(b"", text, generated)
+    if (form == "JPEG" and len(iptc) > _JPEG_SEGMENT - 30) or (form == "WEBP" and iptc):
+        notices.append(f"{form} cannot hold the photo's IPTC data; it is left out.")
+        iptc = b""
+    return packet, iptc, tuple(notices)
+
+
+def _save(file: IO[bytes], samples: Pixels, photo: Photo, **options: Any) -> None:
+    given = {name: value for name, value in _info(photo).items() if value}
     Image.fromarray(samples).save(file, **given, **options)
 
 
-def _write_png(file: IO[bytes], samples: Pixels, photo: Photo, settings: Mapping[str, Any]) -> None:
+def _write_png(
+    file: IO[bytes], samples: Pixels, photo: Photo, settings: Mapping[str, Any], packet: bytes, iptc: bytes
+) -> None:
     info = PngImagePlugin.PngInfo()
+    info.add_itxt(KEY, json.dumps(settings))
+    info.add_itxt("XML:com.adobe.xmp", packet.decode())
+    if iptc:
+        info.add_text("Raw profile type iptc", raw_profile("iptc", iptc).decode(), zip=True)
     if samples.dtype == np.uint8:
-        info.add_itxt(KEY, json.dumps(settings))
-        return _save(file, samples, photo, photo.exif, format="PNG", pnginfo=info, compress_type=STRATEGY)
+        return _save(file, samples, photo, format="PNG", pnginfo=info, compress_type=STRATEGY)
     if photo.icc:
         info.add(b"iCCP", b"ICC profile\0\0" + zlib.compress(photo.icc))
     if photo.dpi:
         info.add(b"pHYs", struct.pack(">2IB", *(round(dots / 0.0254) for dots in photo.dpi), 1))
     if photo.exif:
         info.add(b"eXIf", photo.exif.removeprefix(b"Exif\0\0"))
-    info.add_itxt(KEY, json.dumps(settings))
     write_png(file, samples, info)
 
 
-def _tiff_tags(photo: Photo, settings: Mapping[str, Any]) -> ImageFileDirectory_v2:
-    exif = stamp(photo.exif, settings)
-    tags = ImageFileDirectory_v2()
-    for tag, value in exif.items():
-        tags[tag] = value
-    for ifd in (IFD.Exif, IFD.GPSInfo):
-        if values := exif.get_ifd(ifd):
-            tags[ifd] = values
+def _write_tiff(file: IO[bytes], samples: Pixels, photo: Photo, packet: bytes, iptc: bytes) -> None:
+    tags, children = directories_of(photo.exif)
+    tags[XMP_TAG] = entry(BYTE, packet)
+    if iptc:
+        tags[IPTC_TAG] = entry(UNDEFINED, iptc)
     if photo.icc:
-        tags[34675] = photo.icc
+        tags[34675] = entry(UNDEFINED, photo.icc)
     if photo.dpi:
-        tags[282], tags[283], tags[296] = *photo.dpi, 2  # dots an inch
-    return tags
+        tags[282], tags[283] = (entry(RATIONAL, dots) for dots in photo.dpi)
+        tags[296] = entry(SHORT, 2)  # dots an inch
+    write_tiff(file, samples, tags, children)
+
+
+def _write_exr(path: Path, photo: Photo, settings: Mapping[str, Any], encoding: Encoding) -> tuple[str, ...]:
+    from dior_rt.images.exr import write_exr
+    from dior_rt.images.exr_photo import to_light
+
+    light = to_light(photo)
+    write_exr(path, light.astype(np.float16) if encoding.bits == 16 else light, {KEY: json.dumps(settings)})
+    lost = [name for name, data in (("EXIF", photo.exif), ("XMP", photo.xmp), ("IPTC", photo.iptc)) if data]
+    return (f"EXR cannot hold the photo's {' and '.join(lost)} data; it is left out.",) if lost else ()
+
+
+def _jxl_writer(path: Path) -> Callable[[Path, Pixels, bytes, int | None], None]:
+    try:
+        from dior_rt.images.jxl import write
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"Cannot write {path}: JPEG XL needs one more package: pip install 'dior-rt[jxl]'."
+        ) from error
+    return write
+
+
+def _write_jxl(path: Path, samples: Pixels, photo: Photo, encoding: Encoding) -> tuple[str, ...]:
+    write = _jxl_writer(path)
+    with replacing(path) as file:
+        draft = Path(file.name)
+        named = draft.with_suffix(".jxl")  # the library goes by the name
+        try:
+            write(named, samples, photo.icc, encoding.quality)
+            with named.open("rb") as packed:
+                shutil.copyfileobj(packed, file)
+        except (ValueError, RuntimeError, MemoryError) as error:
+            raise InputError(f"Cannot write {path}: {reason(error)}.") from error
+        finally:
+            named.unlink(missing_ok=True)
+    return ("The JPEG XL file holds no metadata but its profile; --sidecar writes it beside the picture.",)
+
+
+def _has_gain_map(image: Image.Image) -> bool:
+    """Whether a JPEG says that it is Ultra HDR, by its XMP or by ISO 21496-1."""
+    if image.format not in ("JPEG", "MPO"):
+        return False
+    segments = [data for _, data in getattr(image, "applist", [])]
+    return any(b"hdr-gain-map" in data or b"iso:ts:21496" in data for data in segments)
 
 
 def _kind_of(path: Path) -> str:
@@ -294,4 +534,8 @@ def _kind_of(path: Path) -> str:
         return "it is empty"
     if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypmsf1", b"ftyphevc"):
         return "it is a HEIC picture; save it as JPEG or PNG first"
+    if head[:4] == b"8BPS":
+        return (
+            "it is a Photoshop document of a kind that is not read; save it as an 8-bit RGB one, or as TIFF"
+        )
     return "it is not a picture of a known kind (PNG, JPEG, TIFF, WebP ...), or it is damaged"

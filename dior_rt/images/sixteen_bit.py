@@ -12,13 +12,14 @@ from __future__ import annotations
 import struct
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ImageFile, PngImagePlugin, TiffImagePlugin, TiffTags
+from PIL import ImageFile, PngImagePlugin, TiffImagePlugin
 
+from dior_rt.images.directories import HEADER, LONG, SHORT, Directory, Entry, entry, pack
 from dior_rt.images.icc import Pixels
 
 Deep = NDArray[np.uint16]
@@ -78,8 +79,13 @@ def write_png(file: IO[bytes], samples: Deep, info: PngImagePlugin.PngInfo) -> N
     PngImagePlugin.putchunk(file, b"IEND")
 
 
-def write_tiff(file: IO[bytes], samples: Pixels, tags: TiffImagePlugin.ImageFileDirectory_v2) -> None:
-    """A TIFF of (H, W, 3 or 4) uint8 or uint16 samples, deflated as differences, with further tags."""
+def write_tiff(
+    file: IO[bytes], samples: Pixels, tags: Directory, children: Mapping[int, Mapping[int, Entry]]
+) -> None:
+    """A TIFF of (H, W, 3 or 4) uint8 or uint16 samples, deflated as differences, with further tags.
+
+    children: directories by the tag that points at them.
+    """
     height, width, channels = samples.shape
     strips = []
     for top in range(0, height, _ROWS):
@@ -87,15 +93,27 @@ def write_tiff(file: IO[bytes], samples: Pixels, tags: TiffImagePlugin.ImageFile
         rows[:, 1:] -= samples[top : top + _ROWS, :-1]
         packer = zlib.compressobj(strategy=STRATEGY)
         strips.append(packer.compress(rows.astype(rows.dtype.newbyteorder("<")).tobytes()) + packer.flush())
-    lengths = tuple(len(strip) for strip in strips)
-    tags[256], tags[257], tags[258] = width, height, (8 * samples.itemsize,) * channels
-    tags[259], tags[262], tags[277], tags[317] = 8, 2, channels, 2  # deflate, RGB, samples a pixel, predictor
-    tags[278], tags[279] = _ROWS, lengths
-    tags[273] = tuple(sum(lengths[:i]) for i in range(len(lengths)))  # save() counts them from its own end
-    tags.tagtype[273] = tags.tagtype[279] = TiffTags.LONG
+    lengths = [len(strip) for strip in strips]
+    own = {
+        256: entry(LONG, width),
+        257: entry(LONG, height),
+        258: entry(SHORT, *(8 * samples.itemsize,) * channels),
+        259: entry(SHORT, 8),  # deflate
+        262: entry(SHORT, 2),  # RGB
+        277: entry(SHORT, channels),
+        278: entry(LONG, _ROWS),
+        279: entry(LONG, *lengths),
+        317: entry(SHORT, 2),  # differences along the row
+    }
     if channels == 4:
-        tags[338] = 2  # the alpha is not multiplied in
-    tags.save(file)
+        own[338] = entry(SHORT, 2)  # the alpha is not multiplied in
+    starts = [sum(lengths[:i]) for i in range(len(lengths))]
+    for _ in range(2):  # the strips follow the directory, whose size their offsets do not change
+        own[273] = entry(LONG, *starts)
+        head = HEADER + pack({**tags, **own}, children)
+        head += bytes(len(head) % 2)
+        starts = [len(head) + sum(lengths[:i]) for i in range(len(lengths))]
+    file.write(head)
     file.writelines(strips)
 
 

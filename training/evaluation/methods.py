@@ -52,7 +52,7 @@ class Model:
             self.relighter.relight(photo, strokes, self.options, reach=self.settings.reach).picture
         )
 
-    def estimate(self, photo: Photo) -> Raster:
+    def estimate(self, photo: Photo | Raster) -> Raster:
         """Return the estimated source Lumi map on the light grid, (h, w, 3), linear."""
         return self.relighter.estimate(photo, self.options)
 

@@ -16,15 +16,21 @@ from dior_rt.kernels import Strokes
 from dior_rt.training.evaluation import control
 from dior_rt.training.evaluation.baselines import gain, match, quotient
 from dior_rt.training.evaluation.benchmarks import open_benchmarks, renders
+from dior_rt.training.evaluation.judges.models import Blur, BundleModel, Glow
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.lpips import BACKBONES, Lpips
 from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_method
-from dior_rt.training.evaluation.metrics import Photo, psnr, rmse, scaled_psnr, ssim
+from dior_rt.training.evaluation.metrics import Photo, psnr, rmse, scale_invariant_psnr, scaled_psnr, ssim
 from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import DRAWN, OPS, Benchmark, Task
 
 Measure = Callable[[Photo, Photo], float]
-MEASURES: Final[Mapping[str, Measure]] = {"PSNR": psnr, "RMSE": rmse, "SSIM": ssim}
+MEASURES: Final[Mapping[str, Measure]] = {
+    "PSNR": psnr,
+    "SI-PSNR": scale_invariant_psnr,
+    "RMSE": rmse,
+    "SSIM": ssim,
+}
 EXAMPLES: Final = 8  # per benchmark, for the contact sheet
 SECONDS: Final = "seconds"
 PHOTOS: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
@@ -164,6 +170,9 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
     assert driving
     for drawn in DRAWN:
         strokes = driving.control(drawn)
+        if drawn == "strokes":
+            for model in (Glow(BundleModel(method)), Blur()):
+                yield Answer(model.name, drawn, model.relight(task.source, strokes))
         began = time.perf_counter()
         picture = method.relight(task.source, strokes)
         yield Answer(method.name, drawn, picture, time.perf_counter() - began, strokes)
@@ -172,7 +181,7 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
 def _estimated(model: Model, task: Task) -> Task:
     """Return the task with the maps that the model estimates from its two pictures, on the light grid."""
     source, target = model.estimate(task.source), model.estimate(task.truth)
-    return replace(task, source_lumi=source, target_lumi=target, mask=None, interest=None)
+    return replace(task, source_lumi=source, target_lumi=target, mask=None, interest=None, strokes=None)
 
 
 def _estimate_psnr(estimated: Task, task: Task) -> float:

@@ -24,6 +24,7 @@ class Task:
     pictures' size if true, of the light grid if estimated, or None. mask: (h, w), the places of the
     benchmark's strokes. Without it, strokes are cut from the target's map at places decided by seed and
     `interest` (h, w).
+    strokes: the benchmark's strokes, in place of a mask.
     """
 
     name: str
@@ -34,12 +35,15 @@ class Task:
     mask: Raster | None = None
     interest: Raster | None = None
     seed: int = 0
+    strokes: Strokes | None = None
 
     def control(self, drawn: Drawn) -> Strokes:
         """Return the target's full map, or strokes cut from it."""
         assert self.target_lumi is not None
         if drawn == "dense":
             return Strokes(self.target_lumi, np.ones(self.target_lumi.shape[:2], np.float32))
+        if self.strokes is not None:
+            return self.strokes
         if self.mask is not None:
             return Strokes(np.where(self.mask[..., None] > 0, self.target_lumi, 0), self.mask)
         return OPS.sparsify(self.target_lumi, "strokes", self.seed, interest=self.interest)

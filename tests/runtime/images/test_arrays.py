@@ -1,12 +1,18 @@
 """Photos and strokes in memory: every kind that is taken, every kind that is refused."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms, ImageOps
 
 from dior_rt.errors import InputError
-from dior_rt.images.arrays import check_same_shape, like_photo, read_pixels, read_strokes
-from dior_rt.kernels import Strokes
+from dior_rt.images.arrays import check_same_shape, in_primaries_of, like_photo, read_pixels, read_strokes
+from dior_rt.kernels import Stroke, Strokes
+
+sys.path.insert(0, str(Path(__file__).parent))
+import icc
 
 RGB = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
 RGBA = np.random.default_rng(1).integers(0, 256, (5, 7, 4), dtype=np.uint8)
@@ -21,12 +27,46 @@ def test_arrays_pass_as_they_are(dtype):
 
 def test_images_keep_their_alpha_and_their_metadata():
     photo = Image.fromarray(RGBA)
-    photo.info = {"icc_profile": b"profile", "exif": b"exif", "comment": "not ours"}
+    exif = Image.Exif()
+    exif[0x010F] = "Camera Works"
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    photo.info = {"icc_profile": profile, "exif": exif.tobytes(), "comment": "not ours"}
     np.testing.assert_array_equal(read_pixels(photo), RGBA[..., :3])
     back = like_photo(255 - RGBA[..., :3], photo)
-    assert back.mode == "RGBA" and back.info == {"icc_profile": b"profile", "exif": b"exif"}
+    assert back.mode == "RGBA" and set(back.info) == {"icc_profile", "exif"}
+    assert back.info["icc_profile"] == profile
+    assert back.getexif()[0x010F] == "Camera Works"
     np.testing.assert_array_equal(np.asarray(back)[..., 3], RGBA[..., 3])
     np.testing.assert_array_equal(np.asarray(back)[..., :3], 255 - RGBA[..., :3])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+def test_a_phone_photo_stands_upright(tmp_path, orientation, suffix):
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = orientation, "Camera Works"
+    Image.fromarray(RGB).save(tmp_path / f"in.{suffix}", exif=exif.tobytes())
+    with Image.open(tmp_path / f"in.{suffix}") as photo, Image.open(tmp_path / f"in.{suffix}") as twin:
+        seen = np.asarray(ImageOps.exif_transpose(twin).convert("RGB"))
+        pixels = read_pixels(photo)
+        np.testing.assert_array_equal(pixels, seen)
+        back = like_photo(pixels, photo)
+    np.testing.assert_array_equal(np.asarray(back), seen)
+    assert 0x0112 not in back.getexif() and back.getexif()[0x010F] == "Camera Works"
+
+
+def test_light_is_drawn_in_the_primaries_of_the_photo():
+    profile = icc.rgb_profile(icc.PROPHOTO, icc.gamma(1.8))
+    photo = Image.fromarray(RGB)
+    photo.info["icc_profile"] = profile
+    expected = np.linalg.solve(icc.to_xyz(icc.PROPHOTO), icc.to_xyz(icc.SRGB)) @ (1, 0.5, 0.25)
+    (stroke,) = in_primaries_of(photo, [Stroke(((1, 1),), 3.0, (1.0, 0.5, 0.25))])
+    np.testing.assert_allclose(stroke.color, expected, atol=2e-3)
+    light = np.broadcast_to(np.float32([1, 0.5, 0.25]), (4, 4, 3))
+    converted = in_primaries_of(photo, Strokes(light, np.ones((4, 4), np.float32)))
+    np.testing.assert_allclose(converted.light[2, 2], expected, atol=2e-3)
+    plain = [Stroke(((1, 1),), 3.0)]
+    assert in_primaries_of(RGB, plain) is plain
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "1", "CMYK", "YCbCr", "RGBX"])

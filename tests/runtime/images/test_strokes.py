@@ -120,8 +120,10 @@ def test_exr_maps(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_exr(tmp_path / "w.exr", "map"), placed)
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".exr"])
-@pytest.mark.parametrize("wrong", [np.nan, np.inf, -0.25])
+@pytest.mark.parametrize(
+    ("suffix", "wrong"),
+    [(".npy", np.nan), (".npy", np.inf), (".npy", -0.25), (".exr", np.nan), (".exr", np.inf)],
+)
 def test_light_that_cannot_be_is_refused(tmp_path: Path, suffix: str, wrong: float) -> None:
     values = lumi()
     values[4, 5, 1] = wrong
@@ -295,5 +297,7 @@ def test_strokes_come_back(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mask, strokes.mask)
     np.testing.assert_allclose(light[mask > 0], faint.light[mask > 0], atol=0.005)
 
-    with pytest.raises(InputError, match=r"\.png or \.npy"):
+    write_strokes(tmp_path / "s.exr", strokes, {})
+    np.testing.assert_array_equal(read_strokes(tmp_path / "s.exr", SIZE), raster)
+    with pytest.raises(InputError, match=r"\.png, \.npy or \.exr"):
         write_strokes(tmp_path / "s.jpg", strokes, {})
