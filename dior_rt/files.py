@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator
@@ -40,6 +41,14 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
             draft.unlink()
 
 
+def remove_drafts(folder: Path) -> None:
+    """Remove what `replacing` left in a folder where its process was killed."""
+    with contextlib.suppress(OSError):
+        for draft in folder.glob(".*.part"):
+            if re.fullmatch(r"\.[0-9a-f]{16}\.part", draft.name):
+                draft.unlink()
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, and those above it, unless it is there. Raises InputError where that cannot be."""
     try:
@@ -68,6 +77,12 @@ def check_writable(path: Path) -> None:
         probe.unlink()
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {reason(error)}.") from error
+
+
+def check_free(path: Path, overwrite: bool) -> None:
+    """Raise InputError where a file is there already, unless it may be replaced."""
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} is there already. Give --overwrite to replace it, or name another file.")
 
 
 def _shown(target: Path, path: Path) -> Path:

@@ -51,19 +51,25 @@ def info(
     as_json: options.Json = False,
     debug: options.Debug = False,
 ) -> None:
-    """Check a bundle's files and say what is in it.
+    """Check a bundle's files, say what is in it, and which defaults of your own are in force.
+
+    Defaults stand in the file that `config` names, such as preset = "fast", or below a command's name, such
+    as [batch]. Environment variables such as DIOR_PRESET go over them.
 
     \b
       dior-rt info
       dior-rt info my-bundle --json
     """
     from dior_rt.bundle import default_bundle, read_bundle
+    from dior_rt.cli.defaults import config_path, read_defaults, unknown_variables
     from dior_rt.records import unparse
 
     found = read_bundle(bundle or default_bundle())
     manifest = found.manifest
+    config, defaults = config_path(), read_defaults()
     if as_json:
-        say(json.dumps({"folder": str(found.folder), **unparse(manifest)}, indent=2))
+        own = {"config": str(config), "defaults": [unparse(default) for default in defaults]}
+        say(json.dumps({"folder": str(found.folder), **unparse(manifest), **own}, indent=2))
         return
     megabytes = sum((found.folder / file).stat().st_size for file in manifest.files) / 1e6
     rows = {
@@ -78,3 +84,11 @@ def info(
         **{f"parity {name}": f"{value:.4g}" for name, value in manifest.parity.items()},
     }
     table(list(rows.items()))
+    say("")
+    own = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
+    for default in defaults:
+        name = f"{default.command} {default.setting}" if default.command else default.setting
+        value = default.value if isinstance(default.value, str) else " ".join(default.value)
+        own.append((name, f"{value} (from {default.source})"))
+    own += [(name, "no setting has this variable") for name in unknown_variables()]
+    table(own)

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from dior_rt import __version__
-from dior_rt.cli.extras import needs_extra
+from dior_rt.extras import needs_extra
 
 STYLE: dict[str, Any] = {
     "rich_markup_mode": None,
@@ -20,6 +20,7 @@ STYLE: dict[str, Any] = {
 #: The module of dior_rt.cli that holds each command.
 COMMANDS = {
     "relight": "pictures",
+    "batch": "batch",
     "estimate": "pictures",
     "sparsify": "pictures",
     "devices": "about",
@@ -45,13 +46,31 @@ class Commands(TyperGroup):
         alone.command(cmd_name)(body)
         return typer.main.get_command(alone)
 
+    def invoke(self, ctx: Any) -> Any:
+        """Run one of them, with a person's own defaults."""
+        from dior_rt.cli.defaults import COMMANDS, Default, defaults_of, read_defaults
+
+        defaults = read_defaults()
+        ctx.default_map = {name: defaults_of(name, defaults) for name in COMMANDS}
+        typed = [*ctx._protected_args, *ctx.args]
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            # An option that nobody typed came from a default, and the person must know from which.
+            param = error.param
+            setting = "" if param is None else str(param.name).replace("_", "-")
+            from_default: list[Default] = [d for d in defaults if d.setting == setting]
+            if not from_default or param is None or any(name in typed for name in param.opts):
+                raise
+            message = f"{error.message.rstrip('.')}; this default stands in {from_default[-1].source}."
+            raise typer.BadParameter(message, ctx=error.ctx, param=param) from error
+
 
 app = typer.Typer(
     name="dior-rt",
     cls=Commands,
     help="Relight a photograph from light drawn on it.",
     epilog="dior-rt COMMAND --help explains a command, with examples.",
-    add_completion=False,
     **STYLE,
 )
 

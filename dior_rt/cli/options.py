@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -27,7 +27,7 @@ def _finite(value: float | None) -> float | None:
     return value
 
 
-Photo = Annotated[Path, typer.Argument(metavar="PHOTO", help="A PNG, JPEG, TIFF or WebP picture.")]
+Photo = Annotated[Path, typer.Argument(metavar="PHOTO", help="A PNG, JPEG, TIFF or WebP picture ...")]
 Bundle = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="The model [default: the one that ships with dior-rt].")
 ]
@@ -86,6 +86,26 @@ Reach = Annotated[
         "lamp and leaves the rest [default: as far as the model takes it].",
     ),
 ]
+Format = Annotated[
+    Literal["png", "jpg", "tif", "webp", "exr", "jxl"] | None,
+    typer.Option(
+        help="The kind of file to write [default: by the name of OUT, else png, tif for camera raw, or exr "
+        "for EXR]."
+    ),
+]
+Quality = Annotated[
+    int | None,
+    typer.Option(min=1, max=100, help="Of JPEG, WebP and JPEG XL [default: 95; JPEG XL keeps every pixel]."),
+]
+Bits = Annotated[
+    Literal["8", "16", "32"] | None,
+    typer.Option(help="Bits a channel; 16 also computes in 16 [default: as the photo has them]."),
+]
+Sidecar = Annotated[
+    bool, typer.Option("--sidecar", help="Write how the picture was made into an .xmp file beside it.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a result that is there already.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Page = Annotated[
     int,
     typer.Option(min=0, max=999, help="Which page of STROKES is read where it has several; 0 is the first."),

@@ -15,15 +15,17 @@ import typer
 
 from dior_rt import __version__
 from dior_rt.cli import options
+from dior_rt.cli.pipes import standard_files
 from dior_rt.cli.text import say
 from dior_rt.errors import InputError
-from dior_rt.files import is_same_file
+from dior_rt.files import check_free, is_same_file
 from dior_rt.stopwatch import Stopwatch
 
 if TYPE_CHECKING:
     from dior_rt.relight import Relighter
 
 
+@standard_files
 def relight(
     photo: options.Photo,
     strokes: Annotated[
@@ -36,7 +38,10 @@ def relight(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", metavar="OUT", help="PNG, JPEG, TIFF or WebP [default: PHOTO-relit.png]."
+            "--out",
+            "-o",
+            metavar="OUT",
+            help="PNG, JPEG, TIFF, WebP, EXR or JPEG XL; - is standard output [default: PHOTO-relit.png].",
         ),
     ] = None,
     bundle: options.Bundle = None,
@@ -57,6 +62,12 @@ def relight(
         typer.Option(help="Read what is exactly black in STROKES as unspecified; not for JPEG."),
     ] = None,
     page: options.Page = 0,
+    format: options.Format = None,
+    quality: options.Quality = None,
+    bits: options.Bits = None,
+    sidecar: options.Sidecar = False,
+    overwrite: options.Overwrite = False,
+    quiet: options.Quiet = False,
     as_json: options.Json = False,
     debug: options.Debug = False,
 ) -> None:
@@ -78,25 +89,34 @@ def relight(
     Fast, or within half a level of 255 of what all the steps would give:
       dior-rt relight photo.jpg strokes.png --preset fast
       dior-rt relight photo.jpg strokes.png --tolerance 0.5/255
+    Through a pipe, PHOTO or STROKES from standard input:
+      cat photo.jpg | dior-rt relight - strokes.png -o - --format tif > relit.tif
     """
     watch = Watch()
     import numpy as np
 
     from dior_rt.files import check_readable
+    from dior_rt.images.encoding import Encoding
     from dior_rt.images.photo import check_output, read_photo, write_photo
+    from dior_rt.images.readers import default_form
+    from dior_rt.images.sidecar import sidecar_path, write_sidecar
     from dior_rt.images.strokes import read_drawing
 
     check_readable(photo, "photo")
-    out = out or photo.with_name(f"{photo.stem}-relit.png")
+    encoding = Encoding(quality, int(bits) if bits else None)
+    out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or default_form(photo)}"), format)
     _refuse_same(out, photo, strokes)
+    check_free(out, overwrite)
+    if sidecar:
+        check_free(sidecar_path(out), overwrite)
     with _loading(bundle, device, ops) as load:
-        picture = read_photo(photo)
-        check_output(out, picture)
+        picture = read_photo(photo).with_bits(encoding.bits)
+        check_output(out, picture, encoding)
         drawing = read_drawing(strokes, picture.size, key, page, picture.primaries)
         watch.lap("read")
         relighter = load()
         watch.lap("load")
-    with _progress("Relighting") as advance:
+    with _progress("Relighting", quiet) as advance:
         relit = relighter.relight(
             picture.pixels,
             drawing.strokes,
@@ -113,14 +133,10 @@ def relight(
             progress=watch.first_step(advance),
         )
     watch.lap("relight")
-    settings = _settings(relighter) | {
-        **relit.sampling.facts(),
-        "steps": relit.steps,
-        "seed": relit.seed,
-        "intensity": relit.intensity,
-        "reach": relit.reach,
-    }
-    lost = write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings)
+    settings = relighter.facts() | relit.facts()
+    lost = write_photo(out, picture.with_pixels(np.asarray(relit.picture)), settings, encoding)
+    if sidecar:
+        write_sidecar(out, picture, settings)
     watch.lap("write")
     notices = [
         *(f"{photo}: {notice}" for notice in picture.notices),
@@ -128,6 +144,8 @@ def relight(
         *filter(None, [relit.notice, relighter.ops_notice]),
         *lost,
     ]
+    if quiet:
+        notices = []
     _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, notices, as_json)
 
 
@@ -171,7 +189,7 @@ def estimate(
     with _progress("Estimating") as advance:
         lumi = relighter.estimate(picture.pixels, steps=steps, seed=seed, progress=watch.first_step(advance))
     watch.lap("estimate")
-    settings = _settings(relighter) | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
+    settings = relighter.facts() | {"steps": steps or relighter.bundle.manifest.steps, "seed": seed}
     write_lumi(out, lumi, settings, picture.primaries)
     watch.lap("write")
     _report(out, lumi.shape[:2], settings, watch.seconds, relighter, picture.notices, as_json)
@@ -234,17 +252,6 @@ def _loading(bundle: Path | None, device: str, ops: str) -> Iterator[Callable[[]
         yield pool.submit(load).result
 
 
-def _settings(relighter: Relighter) -> dict[str, Any]:
-    """What made the result, for its metadata. The manifest's hash covers those of all files."""
-    return {
-        "version": __version__,
-        "bundle": relighter.bundle.manifest.name,
-        "bundle_sha256": relighter.bundle.sha256,
-        "device": relighter.device,
-        "ops": relighter.ops,
-    }
-
-
 def _report(
     out: Path,
     size: tuple[int, ...],
@@ -281,10 +288,22 @@ def _refuse_same(out: Path, *inputs: Path) -> None:
             raise InputError(f"{out} is read from; name another file for the result.")
 
 
+def _with_format(out: Path, form: str | None) -> Path:
+    """The result's name, which ends as --format says where it has no ending. Raises InputError."""
+    if form is None:
+        return out
+    if not out.suffix:
+        return out.with_suffix(f".{form}")
+    alike = {".jpeg": ".jpg", ".tiff": ".tif"}
+    if alike.get(out.suffix.lower(), out.suffix.lower()) != f".{form}":
+        raise InputError(f"{out} and --format {form} ask for two kinds of file; leave one of them out.")
+    return out
+
+
 @contextmanager
-def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
+def _progress(label: str, quiet: bool = False) -> Iterator[Callable[[int, int], None]]:
     """A callback that moves a bar on a terminal, and does nothing elsewhere."""
-    if not sys.stderr.isatty():
+    if quiet or not sys.stderr.isatty():
         yield lambda step, steps: None
         return
     with typer.progressbar(length=1000, label=label, file=sys.stderr) as bar:

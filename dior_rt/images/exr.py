@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,14 +69,15 @@ def _primaries(header: dict[str, Any]) -> Matrix:
     return to_xyz((rx, ry, gx, gy, bx, by, wx, wy))
 
 
-def write_exr(path: Path, light: NDArray[np.float32]) -> None:
-    """Write (H, W, 3 or 4) linear light as float32 channels R, G, B and A, whole or not at all.
+def write_exr(path: Path, light: NDArray[Any], texts: Mapping[str, str] | None = None) -> None:
+    """Write (H, W, 3 or 4) linear light, float32 or float16, as R, G, B and A, whole or not at all.
 
-    The colours of a picture with A are multiplied by it, as EXR has it. Raises InputError.
+    The colours of a picture with A are multiplied by it, as EXR has it. texts: attributes of the
+    header. Raises InputError.
     """
     import OpenEXR
 
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(texts or {})}
     name = "RGB" if light.shape[2] == 3 else "RGBA"
     with replacing(path) as file, _hushed():
         try:

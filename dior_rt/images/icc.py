@@ -41,6 +41,11 @@ class Curves:
         codes = np.linspace(0, 1, self.srgb.shape[1])
         return bool(np.abs(self.srgb - codes).max() <= 0.5 / 255)
 
+    def with_codes(self, codes: int) -> Curves:
+        """The same curves at another number of codes, by straight lines."""
+        x = np.linspace(0, 1, self.srgb.shape[1])
+        return Curves(np.stack([np.interp(np.linspace(0, 1, codes), x, row) for row in self.srgb]))
+
     def to_srgb(self, pixels: Pixels) -> NDArray[np.uint16]:
         """(H, W, channels) in the photo's own encoding -> uint16, sRGB-encoded."""
         tables = np.round(self.srgb * 65535).astype(np.uint16)

@@ -1,7 +1,8 @@
 """Photos in and out of files: orientation, depth, colour, transparency and metadata survive the way through.
 
-In: PNG, JPEG (MPO too), TIFF, WebP, GIF, BMP, JPEG 2000, AVIF and PPM. Out: PNG, JPEG, TIFF and WebP, by the
-file's suffix. The orientation that EXIF asks for is carried out; the rest of EXIF is kept (see `metadata`).
+In: PNG, JPEG (MPO too), TIFF, WebP, GIF, BMP, JPEG 2000, AVIF, PPM and flat Photoshop documents, and what
+`readers` adds: EXR, HEIC, JPEG XL and camera raw. Out: PNG, JPEG, TIFF, WebP, EXR and JPEG XL, by the file's
+suffix. The orientation that EXIF asks for is carried out; the rest of EXIF is kept (see `metadata`).
 16-bit grey and RGB stay 16-bit (see `sixteen_bit`). An RGB profile is kept with its primaries and honoured in
 its curve (see `icc`); what PNG, AVIF and EXIF say of colour in other ways becomes such a profile
 (`primaries`); other colour spaces become 8-bit sRGB. JPEG and WebP hold 8 bits, so a 16-bit photo is
@@ -11,6 +12,7 @@ rounded when it is written as such.
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 import warnings
 import zlib
@@ -29,6 +31,7 @@ from dior_rt.images import xmp
 from dior_rt.images.camera_raw import RAW, is_raw
 from dior_rt.images.containers import facts_of, read_facts
 from dior_rt.images.directories import BYTE, RATIONAL, SHORT, UNDEFINED, entry
+from dior_rt.images.encoding import BITS, PLAIN, Encoding
 from dior_rt.images.icc import (
     Coloured,
     Curves,
@@ -49,15 +52,25 @@ from dior_rt.images.metadata import (
 )
 from dior_rt.images.netpbm import is_deep_netpbm, read_netpbm
 from dior_rt.images.png_chunks import raw_profile
-from dior_rt.images.primaries import Matrix, srgb
+from dior_rt.images.primaries import Matrix, conversion, srgb
+from dior_rt.images.readers import MissingReader, find_reader
 from dior_rt.images.sixteen_bit import STRATEGY, is_deep, read_deep, write_png, write_tiff
 from dior_rt.images.tiff_pages import read_facts as read_tiff_facts
 
 #: Larger pictures are refused by their header, before they are decoded; Pillow, as it comes, agrees.
 MOST_PIXELS = 178_956_970
 
-_READABLE = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "JPEG2000", "AVIF", "PPM")
-_WRITABLE = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}
+_READABLE = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "JPEG2000", "AVIF", "PPM", "PSD")
+_WRITABLE = {
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".webp": "WEBP",
+    ".exr": "EXR",
+    ".jxl": "JXL",
+}
 _TIFF_HEADS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _JPEG_SEGMENT = 65533
 _LONGEST = {"JPEG": 65500, "WEBP": 16383}
@@ -82,7 +95,8 @@ _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 class Photo:
     """A photo as it is seen, upright.
 
-    pixels: (H, W, 3) uint8 or uint16 on the sRGB curve, in the photo's own primaries. alpha: (H, W) of the
+    pixels: (H, W, 3) uint8 or uint16 on the sRGB curve, in the photo's own primaries; or float32 on that
+    curve, continued above 1 (see `exr_photo`). alpha: (H, W) of the
     file's depth, or None. curves: what the pixels are taken back to when written, where that is not sRGB's
     curve. icc, exif, xmp, iptc: as they are written, b"" for none. dpi: dots an inch across and down, or
     None. notices: sentences about what could not be kept. offset, canvas: where a cut-out picture lies,
@@ -117,9 +131,20 @@ class Photo:
 
     @property
     def bits(self) -> int:
-        """8 or 16 a channel: the depth of the file, and of a file that keeps all of it."""
+        """8, 16 or 32 a channel: the depth of the file, and of a file that keeps all of it."""
+        if self.pixels.dtype == np.float32:
+            return 32
         codes = self.curves.srgb.shape[1] if self.curves else np.iinfo(self.pixels.dtype).max + 1
         return 8 if codes == 256 else 16
+
+    def with_bits(self, bits: int | None) -> Photo:
+        """The same photo with 16 bits a channel where it has 8 and more are asked for, so that its light is
+        computed in them."""
+        if bits != 16 or self.bits != 8:
+            return self
+        wide = self.pixels if self.pixels.dtype == np.uint16 else self.pixels * np.uint16(257)
+        alpha = None if self.alpha is None else self.alpha * np.uint16(257)
+        return replace(self, pixels=wide, alpha=alpha, curves=self.curves and self.curves.with_codes(65536))
 
     def with_pixels(self, pixels: Pixels) -> Photo:
         """The same photo with other pixels of the same shape and dtype."""
@@ -134,24 +159,42 @@ def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
     """
     check_readable(path, what)
     cause: BaseException
+    reader = None
     try:
         with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's doubts about EXIF and size; both are dealt with here
+            if what == "photo" and (reader := find_reader(file.read(64), path.suffix)):
+                return reader.load()(path)
+            file.seek(0)
             return _read(file, page)
+    except InputError:
+        raise
     except UnidentifiedImageError as error:
         cause, problem = error, _kind_of(path)
     except Image.DecompressionBombError as error:
         cause, problem = error, f"it has more than {MOST_PIXELS // 10**6} megapixels"
     except MemoryError as error:
         cause, problem = error, "it does not fit into memory"
+    except MissingReader as error:
+        cause, problem = error, str(error)
     except DAMAGE as error:
         cause, problem = error, reason(error)
+        if reader:
+            problem = f"it is {reader.kind} that is damaged or of an unknown kind ({problem})"
     raise InputError(f"Cannot read the {what} {path}: {problem}.") from cause
 
 
-def check_output(path: Path, photo: Photo) -> None:
-    """Raise InputError where `write_photo(path, photo)` would fail: to be known before the work is done."""
+def check_output(path: Path, photo: Photo, encoding: Encoding = PLAIN) -> None:
+    """Raise InputError where `write_photo` would fail: to be known before the work is done."""
     form = _form(path)
+    if problem := encoding.problem(form):
+        raise InputError(f"Cannot write {path}: {problem}.")
+    if form == "EXR" and photo.icc and conversion(photo.primaries, srgb()) is not None:
+        raise InputError(
+            f"Cannot write {path}: EXR cannot keep the photo's colour profile; name a .tif file."
+        )
+    if form == "JXL":
+        _jxl_writer(path)
     if form == "JPEG" and _is_transparent(photo):
         raise InputError(f"Cannot write {path}: JPEG cannot hold the photo's transparency; name a .png file.")
     if max(photo.size) > _LONGEST.get(form, max(photo.size)):
@@ -162,7 +205,12 @@ def check_output(path: Path, photo: Photo) -> None:
 
 
 def write_photo(
-    path: Path, photo: Photo, settings: Mapping[str, Any], *, generated: bool = True
+    path: Path,
+    photo: Photo,
+    settings: Mapping[str, Any],
+    encoding: Encoding = PLAIN,
+    *,
+    generated: bool = True,
 ) -> tuple[str, ...]:
     """Write a photo whole or not at all, with the settings that made it as JSON in its metadata.
 
@@ -171,8 +219,15 @@ def write_photo(
     the file cannot be written.
     """
     form = _form(path)
-    samples = _samples(photo, form)
+    if form == "EXR":
+        return _write_exr(path, photo, settings, encoding)
+    samples = _samples(photo, form, encoding.bits)
     packet, iptc, notices = _metadata(photo, form, settings, generated)
+    if photo.pixels.dtype == np.float32 and (photo.pixels > 1).any():
+        notices = (*notices, f"{form} ends at display white; name an .exr file to keep brighter light.")
+    if form == "JXL":
+        return (*notices, *_write_jxl(path, samples, photo, encoding))
+    quality = {} if encoding.quality is None else {"quality": encoding.quality}
     with replacing(path) as file:
         try:
             if form == "PNG":
@@ -181,7 +236,7 @@ def write_photo(
                 _write_tiff(file, samples, photo, packet, iptc)
             else:
                 more: dict[str, Any] = {"extra": photoshop_block(iptc)} if iptc else {}
-                _save(file, samples, photo, format=form, xmp=packet, **more, **_SAVE[form])
+                _save(file, samples, photo, format=form, xmp=packet, **more, **(_SAVE[form] | quality))
         except (ValueError, TypeError, ArithmeticError, MemoryError, struct.error) as error:
             raise InputError(f"Cannot write {path}: {reason(error)}.") from error
     return notices
@@ -206,15 +261,20 @@ def _read(file: IO[bytes], page: int) -> Photo:
     image = Image.open(file, formats=_READABLE)
     if image.width * image.height > MOST_PIXELS:
         raise Image.DecompressionBombError
-    pages = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)
+    pages = 1 if image.format in ("MPO", "PSD") else getattr(image, "n_frames", 1)
     if page >= pages:
         raise ValueError(f"it has no page {page}; its pages are 0 to {pages - 1}")
     if page:
         image.seek(page)
     facts = read_facts(file, image, page)
-    notices = (
-        [f"It has {pages} pages; page {page}{', the first,' * (not page)} is read."] if pages > 1 else []
-    )
+    if image.format == "PSD":
+        notices = ["It is a Photoshop document; its flat picture is read, without layers."]
+    elif pages > 1:
+        notices = [f"It has {pages} pages; page {page}{', the first,' * (not page)} is read."]
+    else:
+        notices = []
+    if _has_gain_map(image):
+        notices.append("It has an HDR gain map, which belongs to the photo's old light; it is left out.")
     notices += facts.notices
     image = open_image()
     if is_deep_netpbm(head):
@@ -349,9 +409,9 @@ def _is_transparent(photo: Photo) -> bool:
     return photo.alpha is not None and bool(photo.alpha.min() < np.iinfo(photo.alpha.dtype).max)
 
 
-def _samples(photo: Photo, form: str) -> Pixels:
+def _samples(photo: Photo, form: str, bits: int | None = None) -> Pixels:
     """(H, W, 3 or 4) in the photo's own encoding, at the depth that the file will have."""
-    bits = photo.bits if form in ("PNG", "TIFF") else 8
+    bits = bits or (min(photo.bits, 16) if 16 in BITS[form] else 8)
     pixels = photo.curves.from_srgb(photo.pixels) if photo.curves else photo.pixels
     pixels = _to_depth(pixels, bits)
     if photo.alpha is None or form == "JPEG":
@@ -360,6 +420,11 @@ def _samples(photo: Photo, form: str) -> Pixels:
 
 
 def _to_depth(samples: Pixels, bits: int) -> Pixels:
+    if samples.dtype == np.float32:
+        top = (1 << bits) - 1
+        return np.round(np.clip(samples, 0, 1) * np.float32(top)).astype(np.uint8 if bits == 8 else np.uint16)
+    if samples.dtype == np.uint8 and bits == 16:
+        return samples * np.uint16(257)
     if samples.dtype == np.uint16 and bits == 8:
         return np.round(samples / 257).astype(np.uint8)
     return samples
@@ -417,6 +482,50 @@ def _write_tiff(file: IO[bytes], samples: Pixels, photo: Photo, packet: bytes, i
     write_tiff(file, samples, tags, children)
 
 
+def _write_exr(path: Path, photo: Photo, settings: Mapping[str, Any], encoding: Encoding) -> tuple[str, ...]:
+    from dior_rt.images.exr import write_exr
+    from dior_rt.images.exr_photo import to_light
+
+    light = to_light(photo)
+    write_exr(path, light.astype(np.float16) if encoding.bits == 16 else light, {KEY: json.dumps(settings)})
+    lost = [name for name, data in (("EXIF", photo.exif), ("XMP", photo.xmp), ("IPTC", photo.iptc)) if data]
+    return (f"EXR cannot hold the photo's {' and '.join(lost)} data; it is left out.",) if lost else ()
+
+
+def _jxl_writer(path: Path) -> Callable[[Path, Pixels, bytes, int | None], None]:
+    try:
+        from dior_rt.images.jxl import write
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"Cannot write {path}: JPEG XL needs one more package: pip install 'dior-rt[jxl]'."
+        ) from error
+    return write
+
+
+def _write_jxl(path: Path, samples: Pixels, photo: Photo, encoding: Encoding) -> tuple[str, ...]:
+    write = _jxl_writer(path)
+    with replacing(path) as file:
+        draft = Path(file.name)
+        named = draft.with_suffix(".jxl")  # the library goes by the name
+        try:
+            write(named, samples, photo.icc, encoding.quality)
+            with named.open("rb") as packed:
+                shutil.copyfileobj(packed, file)
+        except (ValueError, RuntimeError, MemoryError) as error:
+            raise InputError(f"Cannot write {path}: {reason(error)}.") from error
+        finally:
+            named.unlink(missing_ok=True)
+    return ("The JPEG XL file holds no metadata but its profile; --sidecar writes it beside the picture.",)
+
+
+def _has_gain_map(image: Image.Image) -> bool:
+    """Whether a JPEG says that it is Ultra HDR, by its XMP or by ISO 21496-1."""
+    if image.format not in ("JPEG", "MPO"):
+        return False
+    segments = [data for _, data in getattr(image, "applist", [])]
+    return any(b"hdr-gain-map" in data or b"iso:ts:21496" in data for data in segments)
+
+
 def _kind_of(path: Path) -> str:
     """Why Pillow does not know the file, as the end of a sentence."""
     with path.open("rb") as file:
@@ -425,4 +534,8 @@ def _kind_of(path: Path) -> str:
         return "it is empty"
     if head[4:12] in (b"ftypheic", b"ftypheix", b"ftypmif1", b"ftypmsf1", b"ftyphevc"):
         return "it is a HEIC picture; save it as JPEG or PNG first"
+    if head[:4] == b"8BPS":
+        return (
+            "it is a Photoshop document of a kind that is not read; save it as an 8-bit RGB one, or as TIFF"
+        )
     return "it is not a picture of a known kind (PNG, JPEG, TIFF, WebP ...), or it is damaged"

@@ -95,7 +95,10 @@ class Broken(Wrong):
         ),
         (Nan, "wrong failed its self-test of reduce_photo of uint8: it is off by nan where 1e-05 is allowed"),
         (OtherMask, "wrong failed its self-test of sparsify to strokes: it is off by 1 where 0 is allowed"),
-        (OtherKind, "wrong failed its self-test of decode_srgb of uint8: the result is of another kind"),
+        (
+            OtherKind,
+            "wrong failed its self-test of decode_srgb of uint8: another shape or dtype",
+        ),
         (Broken, "wrong failed its self-test of draw_strokes (the driver gave up)"),
     ],
 )

@@ -41,7 +41,8 @@ def relight(mini_bundle: Path, folder: Path):
     """Run `dior-rt relight photo.png strokes.png` with further arguments, on the small bundle."""
 
     def call(*arguments: str, photo: str = "photo.png", strokes: str = "strokes.png") -> int:
-        return run(["relight", photo, strokes, "--bundle", str(mini_bundle), "--ops", "numpy", *arguments])
+        common = ["--bundle", str(mini_bundle), "--ops", "numpy", "--overwrite"]
+        return run(["relight", photo, strokes, *common, *arguments])
 
     return call
 
@@ -222,7 +223,12 @@ def test_devices_names_what_the_options_take(mini_bundle: Path, folder: Path, ca
     assert report["network"]["auto"]["reason"] and report["ops"]["auto"]["reason"]
     common = ["--bundle", str(mini_bundle), "--steps", "1"]
     for ops in usable["ops"]:
-        assert run(["relight", "photo.png", "strokes.png", *common, "--ops", ops, "-o", "out.png"]) == 0
+        assert (
+            run(
+                ["relight", "photo.png", "strokes.png", *common, "--ops", ops, "-o", "out.png", "--overwrite"]
+            )
+            == 0
+        )
     capfd.readouterr()
 
     assert run(["devices", "--bundle", str(mini_bundle)]) == 0
@@ -347,7 +353,7 @@ def test_ctrl_c_is_130_and_leaves_nothing(relight, folder: Path, monkeypatch, ca
     from contextlib import contextmanager
 
     @contextmanager
-    def interrupting(label: str):
+    def interrupting(label: str, quiet: bool):
         yield lambda step, steps: signal.raise_signal(signal.SIGINT) if step == 2 else None
 
     monkeypatch.setattr("dior_rt.cli.pictures._progress", interrupting)

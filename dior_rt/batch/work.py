@@ -1,0 +1,95 @@
+"""Relight one photo of a batch, from file to file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dior_rt.batch.journal import Print
+from dior_rt.batch.plan import Job
+from dior_rt.errors import DiorError, InputError
+from dior_rt.files import make_folder, reason
+from dior_rt.images.encoding import PLAIN, Encoding
+from dior_rt.images.photo import check_output, read_photo, write_photo
+from dior_rt.images.sidecar import write_sidecar
+from dior_rt.images.strokes import Key, read_drawing
+
+if TYPE_CHECKING:
+    from dior_rt.relight import Relighter
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How all photos of a batch are relit. options: of `Relighter.relight`. key: as `read_drawing` takes it.
+    sidecar: whether an XMP file is written beside each result."""
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    key: Key | None = None
+    encoding: Encoding = PLAIN
+    sidecar: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job. error: None where its result is written. The prints are of the files as used."""
+
+    job: Job
+    error: str | None = None
+    notices: tuple[str, ...] = ()
+    photo: Print | None = None
+    strokes: Print | None = None
+    output: Print | None = None
+    seconds: float = 0.0
+
+
+def relight_file(
+    relighter: Relighter,
+    job: Job,
+    recipe: Recipe,
+    turn: AbstractContextManager[Any] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Outcome:
+    """Relight the photo into its result; what goes wrong is in the outcome, and nothing is half-written.
+
+    turn: held while the network runs, not while files are read and written.
+    stopped: asked after every step whether to give up.
+    """
+    start = perf_counter()
+    try:
+        photo, strokes = Print.of(job.photo), Print.of(job.strokes)
+        picture = read_photo(job.photo).with_bits(recipe.encoding.bits)
+        make_folder(job.result.parent)
+        check_output(job.result, picture, recipe.encoding)
+        drawing = read_drawing(job.strokes, picture.size, recipe.key, primaries=picture.primaries)
+        with turn or nullcontext():
+            relit = relighter.relight(
+                picture.pixels, drawing.strokes, progress=lambda step, steps: not stopped(), **recipe.options
+            )
+        settings = relighter.facts() | relit.facts()
+        if recipe.sidecar:
+            write_sidecar(job.result, picture, settings)
+        lost = write_photo(
+            job.result, picture.with_pixels(np.asarray(relit.picture)), settings, recipe.encoding
+        )
+        notices = (
+            *picture.notices,
+            *(f"{job.strokes}: {notice}" for notice in drawing.notices),
+            *([relit.notice] if relit.notice else []),
+            *lost,
+        )
+        return Outcome(
+            job, None, notices, photo, strokes, Print.of(job.result), round(perf_counter() - start, 3)
+        )
+    except DiorError as error:
+        return Outcome(job, str(error))
+    except MemoryError:
+        return Outcome(job, "There is not enough memory for it; relight it alone, or make it smaller.")
+    except OSError as error:
+        return Outcome(job, str(InputError(f"Cannot read {job.photo} or {job.strokes}: {reason(error)}.")))
+    except Exception as error:  # one photo must not end the others' work
+        return Outcome(job, f"An unexpected error: {type(error).__name__}: {error}")
