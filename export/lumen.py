@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
 from dior_rt.engine import Engine, Feeds
 from dior_rt.errors import InputError
 from dior_rt.export.check import ExportError, relative_error
-from dior_rt.export.mini import LARGE, answers, open_checked, write_graph
+from dior_rt.export.mini import LARGE, GraphPart, answers, open_checked, write_graph
 from dior_rt.families import lumen
-from dior_rt.flow.sampler import Array, draw_noise
+from dior_rt.flow.sampler import draw_noise
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.grid import GridRule
 from dior_rt.training.lumen.completion import Strokes
@@ -46,7 +45,7 @@ class LumenExportConfig:
     noise_scale: float = 1.0
 
 
-class SceneGraph(torch.nn.Module):
+class SceneGraph(GraphPart):
     """What a photo shows, by name."""
 
     outputs = lumen.SCENE
@@ -64,7 +63,7 @@ class SceneGraph(torch.nn.Module):
         return {"photo": photo}
 
 
-class LightGraph(torch.nn.Module):
+class LightGraph(GraphPart):
     """The velocity of the flow, from a photo's scene and strokes of one blend mode."""
 
     outputs = ("velocity",)
@@ -142,13 +141,13 @@ def export_network(
                 weight.data = weight.data.half().float()
     manifest = describe(config, weights)
     with tempfile.TemporaryDirectory() as scratch:
-        parts: dict[str, SceneGraph | LightGraph] = {
+        parts: dict[str, GraphPart] = {
             "scene": SceneGraph(network),
             "light": LightGraph(network),
         }
         files: dict[str, Path] = {}
         for name, part in parts.items():
-            files |= write_graph(part, name, Path(scratch), config.grid.multiple, weights)  # type: ignore[arg-type]
+            files |= write_graph(part, name, Path(scratch), config.grid.multiple, weights)
         engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
         worst = max(error_of(parts[name], engine, config.grid) for name, engine in engines.items())
         if not worst <= LARGEST_ERROR:
@@ -163,7 +162,7 @@ def export_network(
         return write_bundle(out, manifest, files, overwrite=overwrite)
 
 
-def error_of(part: SceneGraph | LightGraph, engine: Engine, grid: GridRule) -> float:
+def error_of(part: GraphPart, engine: Engine, grid: GridRule) -> float:
     """The largest relative error of a graph against torch, over several grids."""
     worst = 0.0
     for height, width in (grid.shape(1, 1), grid.shape(2, 3), (2 * PATCH, 3 * PATCH)):
@@ -189,13 +188,6 @@ def describe(config: LumenExportConfig, weights: Weights) -> Manifest:
             grid=config.grid,
             noise_scale=config.noise_scale,
             parity={},
-            colour="srgb",
-            settings={},
         )
     except ValueError as error:
         raise InputError(f"The model cannot be run so: {error}.") from error
-
-
-def velocity(network: Lumen, feeds: Feeds) -> Array:
-    """The light graph's velocity in torch."""
-    return answers(LightGraph(network), feeds)["velocity"]

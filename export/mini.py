@@ -122,7 +122,17 @@ def export_network(
         return write_bundle(out, manifest, files, overwrite=overwrite)
 
 
-class Encode(torch.nn.Module):
+class GraphPart(torch.nn.Module):
+    """A part of a network that becomes one graph. outputs: their names, in order."""
+
+    outputs: tuple[str, ...]
+
+    def feeds(self, height: int, width: int, seed: int) -> Feeds:
+        """Return random inputs by name, for a grid of that size."""
+        raise NotImplementedError
+
+
+class Encode(GraphPart):
     """The part of the network that computes the features of photo and strokes."""
 
     outputs = Features._fields
@@ -142,7 +152,7 @@ class Encode(torch.nn.Module):
         return {name: feeds[name] for name in mini.SEEN} | {"own": own}
 
 
-class Step(torch.nn.Module):
+class Step(GraphPart):
     """The part of the network that computes the velocity from the features."""
 
     outputs = ("velocity",)
@@ -173,9 +183,7 @@ class Step(torch.nn.Module):
         return {name: feeds[name] for name in ("x", "sigma", "mode")} | features
 
 
-def write_graph(
-    part: Encode | Step, name: str, folder: Path, multiple: int, weights: Weights
-) -> dict[str, Path]:
+def write_graph(part: GraphPart, name: str, folder: Path, multiple: int, weights: Weights) -> dict[str, Path]:
     """Write one graph and its probe: a small evaluation with the expected outputs. Return the two files.
 
     The expected outputs are torch's. For int8 they are the CPU's, because devices agree with each other
@@ -194,7 +202,7 @@ def write_graph(
     return {graph.name: graph, probe.name: probe}
 
 
-def answers(part: Encode | Step, feeds: Feeds) -> dict[str, Array]:
+def answers(part: GraphPart, feeds: Feeds) -> dict[str, Array]:
     """Return torch's outputs by name. Raises ExportError if they are not finite."""
     with torch.inference_mode():
         found = part(**{name: torch.from_numpy(array) for name, array in feeds.items()})
@@ -204,7 +212,7 @@ def answers(part: Encode | Step, feeds: Feeds) -> dict[str, Array]:
     return {output: array.numpy() for output, array in arrays.items()}
 
 
-def convert(part: Encode | Step, path: Path, multiple: int) -> None:
+def convert(part: GraphPart, path: Path, multiple: int) -> None:
     """Write a part of the network as one portable ONNX graph, optimised, with its weights inside.
 
     Batch, rows and columns vary; the grid's sides are multiples of `multiple`. Raises ExportError.

@@ -298,14 +298,16 @@ def evaluate(
     from dior_rt.training.evaluation.methods import Settings
     from dior_rt.training.evaluation.report import as_json as to_json
     from dior_rt.training.evaluation.report import markdown, write_report
+    from dior_rt.training.evaluation.results import Example
     from dior_rt.training.evaluation.run import Plan, evaluate
 
     settings = Settings(steps, guidance, noise_scale, reach)
     names = parse_judges(judges) if judges is not None else ()
+    examples: list[Example] = []
     if out:
         make_folder(out)  # now, rather than after the work
     if names:
-        evaluation, examples = judge(method, benchmark, names, settings, views), []
+        evaluation = judge(method, benchmark, names, settings, views)
     else:
         evaluation, examples = evaluate(method, benchmark, settings, Plan(views, dabs, lpips, photos))
     if out:

@@ -1,7 +1,7 @@
 """The model families: each turns a photo and strokes into network inputs, and network outputs into light.
 
-A bundle names its family. `mini` and `qwen` are built in. Any installed package can add a family with an
-entry point of the group `dior_rt.families`, whose value is a callable `(bundle, device, threads) -> Family`:
+A bundle names its family. `mini`, `lumen` and `qwen` are built in. Any installed package can add a family with
+an entry point of the group `dior_rt.families`, whose value is a callable `(bundle, device, threads) -> Family`:
 
     [project.entry-points."dior_rt.families"]
     watercolour = "my_package.family:Watercolour"
@@ -27,7 +27,11 @@ C = TypeVar("C")
 #: Entry points of this group add families.
 GROUP: Final = "dior_rt.families"
 #: The built-in families: name -> module and class, imported when a bundle needs them.
-BUILT_IN: Final = {"mini": "dior_rt.families.mini:Mini", "qwen": "dior_rt.families.qwen.model:Qwen"}
+BUILT_IN: Final = {
+    "mini": "dior_rt.families.mini:Mini",
+    "lumen": "dior_rt.families.lumen:Lumen",
+    "qwen": "dior_rt.families.qwen.model:Qwen",
+}
 
 
 class Family(Protocol[C]):

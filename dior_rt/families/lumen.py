@@ -24,16 +24,14 @@ from dior_rt.families import Mode
 from dior_rt.flow.sampler import Array, Condition, Velocity
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.kernels import Ops, Strokes
-from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.kernels.color import linear_to_srgb
+from dior_rt.light import apply_log_ratio, decode_small, encode_lumi, lumi_from_x0
 
 #: The scene graph's outputs; GIVEN: those that the light graph takes.
 SCENE: Final = ("light", "normal", "depth", "sky", "albedo", "bounce", "fine", "half", "quarter", "tokens")
 GIVEN: Final = ("light", "normal", "depth", "sky", "fine", "half", "quarter", "tokens")
-SET, ADD, MULTIPLY = 0, 1, 2
-LUMI_SCALE: Final = 8.0
-FLOOR: Final = 0.02
-BOUNCED: Final = 0.02
-FACTOR_SCALE: Final = 0.5
+SET: Final = 0  # the blend mode of strokes that say what the light is
+BOUNCED: Final = np.float32(0.02)
 SIDE: Final = 128
 NEARBY: Final = SIDE / 10  # cells: how far light bounces to its surroundings
 
@@ -96,7 +94,7 @@ class Lumen:
 
     def velocity(self, condition: Condition, sigmas: Array, guidance: float) -> Velocity:
         """As `Family.velocity`. The null is the photo's own light, which no step has to compute."""
-        own = 2 * encode_light(condition["light"]) - 1
+        own = 2 * encode_lumi(condition["light"]) - 1
         if not condition["mask"].any() or guidance == 0:
             return lambda x, sigma: ((x - own) / np.float32(sigma)).astype(np.float32)
         binding = self._light.bind(
@@ -117,23 +115,12 @@ class Lumen:
 
     def decode_relit(self, x0: Array, condition: Condition) -> Array:
         light, bounce = condition["light"], condition["bounce"]
-        target = decode_light((x0 + 1) / 2)
-        ratio = log_ratio(light, target, bounce)
-        relit = (srgb_to_linear(condition["photo"]) + FLOOR) * np.exp(np.clip(ratio, -6, 6)) - FLOOR
+        ratio = log_ratio(light, lumi_from_x0(x0), bounce)
+        relit = apply_log_ratio(decode_small(condition["photo"]), np.clip(ratio, -6, 6))
         return _pixels(np.clip(linear_to_srgb(np.clip(relit, 0, 1)), 0, 1))
 
     def decode_lumi(self, x0: Array, condition: Condition) -> Array:
-        return _pixels(decode_light((x0 + 1) / 2))
-
-
-def encode_light(light: Array) -> Array:
-    """log(1 + 8 L) / log 9."""
-    return np.log1p(LUMI_SCALE * light) / np.float32(np.log1p(LUMI_SCALE))
-
-
-def decode_light(encoded: Array) -> Array:
-    """Invert `encode_light`; negative codes become 0."""
-    return np.expm1(np.maximum(encoded, 0) * np.float32(np.log1p(LUMI_SCALE))) / np.float32(LUMI_SCALE)
+        return _pixels(lumi_from_x0(x0))
 
 
 def log_ratio(source: Array, target: Array, bounce: Array) -> Array:

@@ -111,7 +111,7 @@ def load_imagenet(backbone: Backbone, path: Path) -> None:
         conv.bias.data.copy_(stored[f"{norm}.bias"] - stored[f"{norm}.running_mean"] * scale)
 
     fold(backbone.stem, "_conv_stem.weight", "_bn0")
-    blocks = [block for stage in backbone.stages for block in stage]  # type: ignore[union-attr]
+    blocks = [block for block in backbone.modules() if isinstance(block, Inverted)]
     for k, block in enumerate(blocks):
         name = f"_blocks.{k}"
         if block.expand is not None:
