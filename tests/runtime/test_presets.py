@@ -81,7 +81,7 @@ def test_keywords_go_over_the_options_and_are_the_same_fields() -> None:
         (None, {"interval": (-0.1, 0.2)}, "interval must be two numbers"),
         (None, {"interval": (float("nan"), 0.2)}, "interval must be two numbers"),
         (None, {"guidance": float("inf")}, "guidance must lie"),
-        (None, {"noise_scale": -1.0}, "noise_scale must be"),
+        (None, {"noise_scale": -1.0}, "noise_scale must lie"),
         (None, {"tolerance": 0.0}, "tolerance must lie between 0 and 1"),
         (None, {"tolerance": float("nan")}, "tolerance must lie between 0 and 1"),
         (None, {"tolerance": 0.01, "steps": 4}, "A tolerance chooses the steps"),
