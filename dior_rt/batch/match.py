@@ -29,6 +29,7 @@ def find_strokes(photo: Path, place: Path, strokes: Path | None) -> Path:
     """
     if strokes is not None and not strokes.is_dir():
         return strokes
+    plain: tuple[str, ...]
     if strokes is None:
         folders, plain = [photo.parent], NO_PHOTO
     else:

@@ -76,7 +76,11 @@ class RayEngine:
             threads = os.environ.get("OMP_NUM_THREADS") or str(usable_cores())
             environment = {"env_vars": {"OMP_NUM_THREADS": threads}}
             ray.init(
-                self.address, log_to_driver=False, logging_level="ERROR", runtime_env=environment, **alone
+                self.address,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                runtime_env=environment,
+                **alone,
             )
         except Exception as error:  # Ray raises a bare Exception where its own processes do not start
             raise DeviceError(f"Cannot use Ray's cluster {self.address or ''}: {reason(error)}.") from error
@@ -94,7 +98,7 @@ class RayEngine:
         rows = [{"job": pickle.dumps(job)} for job in jobs]
         most = self.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         done = ray.data.from_items(rows, override_num_blocks=min(len(rows), MOST_TASKS)).map(
-            Worker,
+            Worker,  # type: ignore[arg-type] - an instance is called
             fn_constructor_args=(self.bundle.resolve(), self.device, self.ops, recipe),
             compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(most, len(rows))),
             num_cpus=1,

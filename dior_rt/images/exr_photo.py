@@ -26,14 +26,14 @@ def read(path: Path) -> Photo:
     """Read the first part; its colours come in sRGB's primaries. Raises InputError."""
     picture = read_exr_picture(path, "photo")
     light, notices = picture.pixels[..., :3], []
-    broken = ~np.isfinite(light).all(axis=-1)
+    broken: NDArray[np.bool_] = np.logical_not(np.isfinite(light).all(axis=-1))
     if broken.any():
         notices.append(f"{int(broken.sum())} of its pixels are not finite; they are read as black.")
         light = np.where(broken[..., None], np.float32(0), light)
     alpha = None
     if picture.pixels.shape[2] == 4:
         alpha = np.clip(np.nan_to_num(picture.pixels[..., 3]), 0, 1).astype(np.float32)
-        light = np.divide(light, alpha[..., None], out=np.zeros_like(light), where=alpha[..., None] > 0)
+        light = np.divide(light, alpha[..., None], out=np.zeros_like(light), where=(alpha > 0)[..., None])
     if (matrix := conversion(picture.primaries, srgb())) is not None:
         light = convert(light, matrix).astype(np.float32)
         notices.append("Its colours are converted to sRGB's primaries.")

@@ -9,7 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from dior_rt.images.photo import Photo
 
 HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 RAW_SUFFIXES: Final = (
@@ -32,7 +35,7 @@ class Reader:
     extra: str | None
     fits: Callable[[bytes, str], bool]
 
-    def load(self) -> Callable[[Path], object]:
+    def load(self) -> Callable[[Path], Photo]:
         """The module's `read`. Raises MissingReader where its extra is not installed."""
         try:
             return import_module(f"dior_rt.images.{self.module}").read
