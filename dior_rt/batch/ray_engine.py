@@ -11,7 +11,7 @@ import logging
 import os
 import pickle
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -57,7 +57,9 @@ class RayEngine:
     address: str | None = None
     workers: int | None = None
 
-    def run(self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]) -> Iterator[Outcome]:
+    def run(
+        self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]
+    ) -> Generator[Outcome, None, None]:
         """Yield the outcomes as they come; `begin` is told the results' names before any is written.
 
         Raises DeviceError where the cluster cannot be reached, or gives up.
@@ -98,7 +100,7 @@ class RayEngine:
         rows = [{"job": pickle.dumps(job)} for job in jobs]
         most = self.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         done = ray.data.from_items(rows, override_num_blocks=min(len(rows), MOST_TASKS)).map(
-            Worker,  # type: ignore[arg-type] - an instance is called
+            Worker,  # type: ignore[arg-type]
             fn_constructor_args=(self.bundle.resolve(), self.device, self.ops, recipe),
             compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(most, len(rows))),
             num_cpus=1,

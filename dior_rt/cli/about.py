@@ -85,10 +85,10 @@ def info(
     }
     table(list(rows.items()))
     say("")
-    own = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
+    lines: list[tuple[str, object]] = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
     for default in defaults:
         name = f"{default.command} {default.setting}" if default.command else default.setting
         value = default.value if isinstance(default.value, str) else " ".join(default.value)
-        own.append((name, f"{value} (from {default.source})"))
-    own += [(name, "no setting has this variable") for name in unknown_variables()]
-    table(own)
+        lines.append((name, f"{value} (from {default.source})"))
+    lines += [(name, "no setting has this variable") for name in unknown_variables()]
+    table(lines)
