@@ -226,7 +226,8 @@ class Relighter:
         if self.bundle.manifest.grid is None:  # what paints whole pictures has learnt from such as these
             seen = shrink(pixels, raster)
             return _linear(seen), seen
-        source = self._ops.reduce_photo(pixels, raster)
+        # The network knows nothing brighter than white; its ratio there goes for brighter light as well.
+        source = np.minimum(self._ops.reduce_photo(pixels, raster), np.float32(1))
         return source, np.clip(linear_to_srgb(source), 0, 1).astype(np.float32)
 
     def _reduce_strokes(
