@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path, PurePosixPath
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from dior_rt.errors import BundleError
 from dior_rt.files import reason
@@ -29,6 +29,8 @@ FORMAT: Final = 2
 MANIFEST = "manifest.json"
 MOST_MANIFEST_BYTES = 1 << 20
 MOST_STEPS = 1000
+#: Entries of manifest.json that format 2 requires and that have one value only; nothing depends on them.
+CONSTANTS: Final[dict[str, Any]] = {"colour": "srgb", "settings": {}}
 
 
 @dataclass(frozen=True)
@@ -61,14 +63,13 @@ class Manifest:
     precision: how the weights are stored ("fp32", "fp16", "int4" ...).
     files: relative path -> sha256 in hex, filled in by `write_bundle`.
     steps, guidance: what is used where the caller names nothing.
-    colour: how the pixels of the network's photo are encoded.
     grid: the size rule, for families that predict on a light grid.
     noise_scale: standard deviation of the starting noise; 1 draws from the posterior, 0 starts at the mean.
-    parity: figures measured at export. settings: the family's own numbers and words.
+    parity: figures measured at export.
     """
 
     format: Literal[2] = FORMAT
-    family: Literal["mini", "qwen"]
+    family: str
     name: str
     licence: str
     precision: str
@@ -77,11 +78,9 @@ class Manifest:
     schedule: ShiftSchedule | DynamicShiftSchedule
     steps: int
     guidance: float
-    colour: Literal["srgb", "linear"]
     grid: GridRule | None
     noise_scale: float
     parity: dict[str, float]
-    settings: dict[str, str | int | float | bool | None]
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= MOST_STEPS:
@@ -186,11 +185,31 @@ def _read_manifest(folder: Path) -> Manifest:
         if type(version) is int and version != FORMAT:
             way = "update dior-rt" if version > FORMAT else "export its model again"
             raise ValueError(f"it has format {version}, and this dior-rt reads {FORMAT}: {way}")
-        return parse(Manifest, document)
+        return parse(Manifest, _without_constants(document))
     except FileNotFoundError:
         raise BundleError(f"{folder} is no bundle: it has no {MANIFEST}.") from None
     except (OSError, ValueError) as error:
         raise BundleError(f"Cannot read {folder / MANIFEST}: {reason(error)}.") from error
+
+
+def _to_document(manifest: Manifest) -> dict[str, Any]:
+    """Return the manifest as JSON data, with the constants at the places where format 2 has them."""
+    document = unparse(manifest)
+    assert isinstance(document, dict)
+    before_grid = list(document).index("grid")
+    items = list(document.items())
+    items.insert(before_grid, ("colour", CONSTANTS["colour"]))
+    return dict(items) | {"settings": CONSTANTS["settings"]}
+
+
+def _without_constants(document: Any) -> Any:
+    """Return the JSON data without the constants. ValueError where one has another value."""
+    if not isinstance(document, dict):
+        return document
+    for name, value in CONSTANTS.items():
+        if document.get(name, value) != value:
+            raise ValueError(f"{name} must be {json.dumps(value)}")
+    return {name: value for name, value in document.items() if name not in CONSTANTS}
 
 
 def _check_relative(path: str) -> None:
@@ -232,7 +251,7 @@ def _fill(draft: Path, manifest: Manifest, files: Mapping[str, Path]) -> Manifes
             shutil.copyfile(source, path)
         digests[relative] = _sha256(path)
     written = replace(manifest, files=digests)
-    text = json.dumps(unparse(written), indent=2, allow_nan=False)
+    text = json.dumps(_to_document(written), indent=2, allow_nan=False)
     (draft / MANIFEST).write_text(text + "\n", encoding="utf-8")
     return written
 

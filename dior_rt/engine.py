@@ -147,13 +147,13 @@ def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
         raise InputError(f"The network expects {sorted(expected)} and got {sorted(feeds)}.")
     sides: dict[str, int] = {}
     for tensor in inputs:
-        array, known = feeds[tensor.name], dict(sides)
+        array, lengths = feeds[tensor.name], dict(sides)
         fits = array.dtype == tensor.dtype and array.ndim == len(tensor.shape)
         for side, size in zip(tensor.shape, array.shape, strict=False):
             fits &= size == (side if isinstance(side, int) else sides.setdefault(side, size))
             fits &= size > 0 and size % _multiple(side) == 0
         if not fits:
-            shape = [known.get(side, side) if isinstance(side, str) else side for side in tensor.shape]
+            shape = [lengths.get(side, side) if isinstance(side, str) else side for side in tensor.shape]
             raise InputError(
                 f"The network's input {tensor.name!r} expects {tensor.dtype} {_by(shape)} "
                 f"and got {array.dtype} {_by(array.shape)}."

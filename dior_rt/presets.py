@@ -1,17 +1,18 @@
-"""How the flow is walked, and the presets: ways to walk it faster whose name promises an error.
+"""The presets of a bundle: faster ways to sample, each of which promises an error.
 
-`reference` is the model's own: all of its steps, by Euler's method, with guidance at every sigma. The others
-are data of the bundle, in presets.json: they were measured with its model, by `tools.presets`.
+`reference` is the model's own way: all of its steps, by Euler's method, with guidance at every sigma. The
+other presets are data of the bundle, in presets.json. `python -m tools.presets` measures them with its
+model.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from dior_rt.bundle import MOST_STEPS, Bundle
-from dior_rt.errors import BundleError, InputError
+from dior_rt.errors import BundleError
 from dior_rt.files import reason
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.flow.solvers import SOLVERS
@@ -24,17 +25,19 @@ PRESETS: Final = "presets.json"
 MOST_BYTES: Final = 1 << 16
 
 ALWAYS: Final = (0.0, 1.0)
-MOST_GUIDANCE: Final = 1000.0  # far beyond any use; float32 still holds what the network makes of it
 
 
 @dataclass(frozen=True)
 class Preset:
-    """steps: of the solver. solver: its name. shift: of the schedule of sigmas; None is the model's own.
-    interval: of the sigmas, both ends included, at which guidance acts. Raises ValueError."""
+    """How to walk the flow, measured with one model. Raises ValueError."""
 
+    #: Number of solver steps.
     steps: int
+    #: Name of the solver.
     solver: str = "euler"
+    #: Shift of the schedule of sigmas; None keeps the model's schedule.
     shift: float | None = None
+    #: The sigmas (low, high), both ends included, at which guidance acts.
     interval: tuple[float, float] = ALWAYS
 
     def __post_init__(self) -> None:
@@ -46,64 +49,6 @@ class Preset:
             ShiftSchedule(self.shift)
         if not (len(self.interval) == 2 and 0 <= self.interval[0] <= self.interval[1] <= 1):
             raise ValueError(f"interval must be two numbers, 0 <= low <= high <= 1, not {self.interval}")
-
-
-@dataclass(frozen=True)
-class Sampling(Preset):
-    """A preset together with what it leaves to the model or the caller.
-
-    preset: the name it began with. guidance: the scale. tolerance: None, or the error, RMS of the final
-    picture in shares of display white, within which steps are chosen on the way; `steps` and `solver` are
-    then not used.
-    """
-
-    preset: str = REFERENCE
-    guidance: float = 1.0
-    tolerance: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.guidance <= MOST_GUIDANCE:
-            raise ValueError(f"guidance must lie between 0 and {MOST_GUIDANCE:g}, not {self.guidance:g}")
-        if self.tolerance is not None and not 0 < self.tolerance < 1:
-            raise ValueError(f"tolerance must lie between 0 and 1, not {self.tolerance}")
-
-    def facts(self) -> dict[str, Any]:
-        """What decides the result, for its metadata."""
-        unused = ("tolerance",) if self.tolerance is None else ("steps", "solver")
-        return {name: value for name, value in asdict(self).items() if name not in unused}
-
-
-def sampling(bundle: Bundle, preset: str | None = None, **asked: Any) -> Sampling:
-    """How to walk the flow: by a preset's settings, over which those in `asked` go that are not None.
-
-    Raises InputError for settings that cannot be, and BundleError.
-    """
-    preset, manifest = preset or REFERENCE, bundle.manifest
-    began = Preset(manifest.steps)
-    if preset != REFERENCE:
-        presets = read_presets(bundle)
-        if preset not in presets:
-            known = ", ".join((REFERENCE, *presets))
-            raise InputError(f"The model {manifest.name} has no preset {preset!r}, only: {known}.")
-        began = presets[preset]
-    given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-    if "tolerance" in given and given.keys() & {"steps", "solver"}:
-        raise InputError("A tolerance chooses the steps and brings its own solver; leave the other two out.")
-    try:
-        own = Sampling(**vars(began), preset=preset, guidance=manifest.guidance)
-        chosen = replace(own, **given)
-    except ValueError as error:
-        raise InputError(f"{error}.") from error
-    if chosen.shift is not None and not isinstance(manifest.schedule, ShiftSchedule):
-        raise InputError(
-            f"The model {manifest.name} has a schedule whose shift is not for the caller to set."
-        )
-    if chosen.tolerance is not None and manifest.grid is None:
-        raise InputError(
-            f"The model {manifest.name} takes steps, not a tolerance: it predicts no light grid."
-        )
-    return chosen
 
 
 def read_presets(bundle: Bundle) -> dict[str, Preset]:

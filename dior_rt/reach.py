@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dior_rt.errors import InputError
 from dior_rt.flow.sampler import Array
-from dior_rt.kernels.transfer import EPSILON
+from dior_rt.light import apply_log_ratio, log_ratio
 
 LEAST: Final = 1e-3  # of the picture's longer side: finer than any light grid
 
@@ -22,13 +22,12 @@ def check_reach(reach: float | None) -> None:
 
 
 def within_reach(source: Array, relit: Array, mask: Array, reach: float) -> Array:
-    """(relit + e) / (source + e) to the power of `closeness`, times source + e, less e: e as in `transfer`.
+    """Return the relit light with its log-ratio to the source scaled by `closeness`.
 
     source, relit: (h, w, 3) linear light; mask: (h, w), above 0 where anything is drawn.
     """
-    e = np.float32(EPSILON)
-    ratio = np.log((relit + e) / (source + e)) * closeness(mask > 0, reach)[..., None]
-    return np.maximum((source + e) * np.exp(ratio) - e, 0)  # black comes back as a rounding error
+    ratio = log_ratio(relit, source) * closeness(mask > 0, reach)[..., None]
+    return apply_log_ratio(source, ratio)
 
 
 def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:

@@ -8,18 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dior_rt import __version__
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
 from dior_rt.errors import Cancelled, DeviceError, InputError
-from dior_rt.families import Family
-from dior_rt.families.mini import Mini
-from dior_rt.families.qwen.frame import shrink
-from dior_rt.families.qwen.model import Qwen
+from dior_rt.families import open_family
 from dior_rt.flow.adaptive import sample_within
 from dior_rt.flow.sampler import Array, State, Velocity, between, draw_noise, sample
 from dior_rt.flow.schedule import ShiftSchedule
@@ -32,10 +28,11 @@ from dior_rt.images.arrays import (
     read_strokes,
 )
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
-from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.kernels.types import STRONGEST
-from dior_rt.presets import ALWAYS, REFERENCE, Sampling, read_presets, sampling
+from dior_rt.light import decode_small
+from dior_rt.presets import ALWAYS, REFERENCE, read_presets
 from dior_rt.reach import check_reach, within_reach
+from dior_rt.sampling import DEFAULTS, Sampling, SamplingFields, SamplingOptions, resolve_sampling
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
@@ -106,13 +103,18 @@ class Relighter:
         threads: CPU threads for the network. Raises BundleError, and DeviceError for a device that is not
         there or computes wrong results.
         """
-        self.bundle = read_bundle(Path(bundle) if bundle else default_bundle())
+        self._bundle = read_bundle(Path(bundle) if bundle else default_bundle())
         with ThreadPoolExecutor(1) as pool:  # a cold device compiles its kernels while the network loads
             opening = pool.submit(open_ops, ops)
             self._family = open_family(self.bundle, device, threads)
             with _device_errors():
                 self._ops = opening.result()
         self.device, self.device_reason = self._family.device, self._family.reason
+
+    @property
+    def bundle(self) -> Bundle:
+        """The bundle that was loaded."""
+        return self._bundle
 
     @property
     def ops(self) -> str:
@@ -122,6 +124,11 @@ class Relighter:
     @property
     def ops_reason(self) -> str:
         return self._ops.reason
+
+    @property
+    def ops_notice(self) -> str:
+        """What the user should know of that choice, such as a driver that crashes; "" for nothing."""
+        return self._ops.notice
 
     @property
     def presets(self) -> tuple[str, ...]:
@@ -143,45 +150,34 @@ class Relighter:
         self,
         photo: Picture,
         strokes: Strokes | Sequence[Stroke] | Picture,
+        options: SamplingOptions = DEFAULTS,
         *,
-        preset: str | None = None,
-        steps: int | None = None,
-        solver: str | None = None,
-        shift: float | None = None,
-        guidance: float | None = None,
-        interval: tuple[float, float] | None = None,
-        tolerance: float | None = None,
         seed: int = 0,
         intensity: float = 1.0,
         reach: float | None = None,
         progress: Progress | None = None,
+        **fields: Unpack[SamplingFields],
     ) -> Relit:
-        """The photo under the light of the strokes.
+        """Return the photo under the light of the strokes.
 
         photo: a Pillow image, which is read as its file would be (upright by its EXIF, in the colours of its
-        profile); or an array (H, W, 3), sRGB, of uint8, uint16, or float32 in 0..1.
-        strokes: Strokes, or RGBA as a Pillow image or an array (H, W, 4); alpha 0 = unspecified, integers are
-        sRGB-encoded and floats linear. Shaped like the photo, or like its light grid; any size. Or a list of
-        Stroke, in pixels of the photo.
-        preset: "reference" or a faster one of the model's own, such as "fast"; see `Relighter.presets`.
-        steps, solver, shift, guidance, interval, tolerance: each goes over the preset's where it is not None;
-        see `Sampling`. intensity: multiplies the light, >= 0. reach: how far from the strokes light changes,
-        in longer sides of the photo, see `within_reach`; None: as far as the model takes it.
-        progress: called after each step with (step, steps), of which it passes several at a time where the
-        solver chooses its own; returning False stops with Cancelled.
+          profile); or an array (H, W, 3), sRGB, of uint8, uint16, or float32 in 0..1.
+        strokes: one of
+          - Strokes, or RGBA as a Pillow image or an array (H, W, 4), shaped like the photo or like its light
+            grid, of any size; alpha 0 = unspecified, integers are sRGB-encoded and floats linear;
+          - a list of Stroke, in pixels of the photo.
+        options: how the flow is sampled. The fields of SamplingOptions may also be given as keywords, such
+          as preset="fast" or steps=4; a keyword takes precedence.
+        seed: of the starting noise.
+        intensity: multiplies the light of the strokes, >= 0.
+        reach: how far from the strokes light changes, in longer sides of the photo, see `within_reach`;
+          None leaves it to the model.
+        progress: called after each step with (step, steps); it may skip steps where the solver chooses its
+          own. Returning False stops with Cancelled.
 
         Raises InputError for what cannot be used, and DeviceError where a device fails.
         """
-        how = sampling(
-            self.bundle,
-            preset,
-            steps=steps,
-            solver=solver,
-            shift=shift,
-            guidance=guidance,
-            interval=interval,
-            tolerance=tolerance,
-        )
+        how = resolve_sampling(self.bundle, options.override(**fields))
         _check_seed(seed)
         _check_intensity(intensity)
         check_reach(reach)
@@ -193,12 +189,14 @@ class Relighter:
             return Relit(
                 like_photo(pixels.copy(), photo), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach
             )
-        source, encoded = self._reduce_photo(pixels, raster)
+        source, encoded = self._family.reduce_photo(pixels, raster, self._ops)
+        # The network knows nothing brighter than white; its ratio there goes for brighter light as well.
+        source = np.minimum(source, np.float32(1))
         watch.lap("kernels")
         condition = self._family.encode(encoded, drawn, "relight")
         x0, taken = self._sample(condition, how, seed, progress)
         watch.lap("steps")
-        relit = _linear(self._family.decode_relit(x0, condition))
+        relit = decode_small(self._family.decode_relit(x0, condition))
         if reach is not None:
             relit = within_reach(source, relit, drawn.mask, reach)
         picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
@@ -207,28 +205,26 @@ class Relighter:
 
     @_device_errors()
     def estimate(
-        self, photo: Picture, *, steps: int | None = None, seed: int = 0, progress: Progress | None = None
+        self,
+        photo: Picture,
+        options: SamplingOptions = DEFAULTS,
+        *,
+        seed: int = 0,
+        progress: Progress | None = None,
+        **fields: Unpack[SamplingFields],
     ) -> Array:
-        """The photo's own light: a dense Lumi map (h, w, 3), linear float32 >= 0, of its light grid.
+        """Return the photo's source Lumi map (h, w, 3) on its light grid, linear float32 >= 0.
 
-        Arguments and errors are those of `relight`.
+        Arguments and errors are those of `relight`; guidance is 1, because there are no strokes.
         """
-        how = sampling(self.bundle, steps=steps, guidance=1.0)
+        how = resolve_sampling(self.bundle, replace(options.override(**fields), guidance=1.0))
         _check_seed(seed)
         pixels = read_pixels(photo)
-        _, encoded = self._reduce_photo(pixels, self._family.raster(*pixels.shape[:2]))
+        raster = self._family.raster(*pixels.shape[:2])
+        _, encoded = self._family.reduce_photo(pixels, raster, self._ops)
         condition = self._family.encode(encoded, None, "estimate")
         x0, _ = self._sample(condition, how, seed, progress)
         return self._family.decode_lumi(x0, condition)
-
-    def _reduce_photo(self, pixels: NDArray, raster: tuple[int, int]) -> tuple[Array, Array]:
-        """The photo on its raster, linear and sRGB-encoded 0..1."""
-        if self.bundle.manifest.grid is None:  # what paints whole pictures has learnt from such as these
-            seen = shrink(pixels, raster)
-            return _linear(seen), seen
-        # The network knows nothing brighter than white; its ratio there goes for brighter light as well.
-        source = np.minimum(self._ops.reduce_photo(pixels, raster), np.float32(1))
-        return source, np.clip(linear_to_srgb(source), 0, 1).astype(np.float32)
 
     def _reduce_strokes(
         self,
@@ -270,7 +266,7 @@ class Relighter:
     ) -> tuple[Array, int]:
         """The state at the end of the flow, and how many steps led there."""
         noise = draw_noise(seed, self._family.noise_shape(condition))
-        noise *= np.float32(self.bundle.manifest.noise_scale)
+        noise *= np.float32(how.noise_scale)
         taken = 0
         for state in self._states(condition, how, noise):
             taken += 1
@@ -301,18 +297,6 @@ class Relighter:
         if how.interval == ALWAYS or how.guidance == 1:
             return guided
         return between(*how.interval, guided, self._family.velocity(condition, sigmas, 1.0))
-
-
-def _linear(encoded: Array) -> Array:
-    """A small picture in linear light, without a device's help: that would have to compile for it."""
-    return srgb_to_linear(encoded).astype(np.float32)
-
-
-def open_family(bundle: Bundle, device: str, threads: int | None) -> Family[Any]:
-    """Load a bundle's networks; raises what its family raises."""
-    if bundle.manifest.family == "mini":
-        return Mini(bundle, device, threads)
-    return Qwen(bundle, device, threads)
 
 
 def _check_intensity(intensity: float) -> None:

@@ -1,4 +1,5 @@
-"""From trained weights to a bundle: merge, convert, check. Imported as `dior_rt.export`; needs the extra."""
+"""Turn trained weights into a bundle: merge, convert, check. Imported as `dior_rt.export`; needs the
+extra."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ __all__ = ["export_checkpoint"]
 
 
 def __getattr__(name: str) -> Any:
-    # Qwen's export shares this package and needs none of mini's training.
+    # Qwen's export is in this package too, and does not need mini's training code.
     if name == "export_checkpoint":
         from dior_rt.export.mini import export_checkpoint
 

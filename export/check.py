@@ -1,4 +1,4 @@
-"""Parity: what an exported mini computes, against torch. Over a bar the export fails; figures are kept."""
+"""Compare an exported mini with torch. The export fails above a bar; the figures go into the manifest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dior_rt.kernels import Strokes
 
 SIGMAS: Final = (1.0, 0.9, 0.5, 0.1, 1e-3)
 SEEDS: Final = (0, 1, 2)
-# How many units of the data variable span black to white.
+# The range of the data variable from black to white.
 SPAN: Final[dict[Mode, float]] = {"relight": 4.0, "estimate": 2.0}
 
 Bind = Callable[[Condition], Velocity]
@@ -28,18 +28,20 @@ Bind = Callable[[Condition], Velocity]
 
 @dataclass(frozen=True)
 class Bars:
-    """evaluation: the largest error of one, relative to its largest value. sampling: dB, after all steps."""
+    """evaluation: the largest error of one evaluation, relative to its largest value. sampling: dB at the
+    end."""
 
     evaluation: float
     sampling: float
 
 
 class ExportError(DiorError):
-    """A checkpoint that cannot be exported, or an export that computes something else than its source."""
+    """A checkpoint that cannot be exported, or an export that differs from its source."""
 
 
 def check_evaluations(network: torch.nn.Module, graphs: mini.Graphs, grid: GridRule, bars: Bars) -> float:
-    """The largest relative error of one evaluation, over sigmas, grids, modes, seeds and hostile inputs."""
+    """Return the largest relative error of one evaluation over sigmas, grids, modes, seeds and hostile
+    inputs."""
     worst = 0.0
     for feeds in _all_feeds(grid):
         worst = max(worst, relative_error(run(graphs, feeds), evaluate(network, feeds)))
@@ -58,7 +60,7 @@ def check_sampling(
     guidance: float,
     bars: Bars,
 ) -> float:
-    """The lowest PSNR, in dB, between whole runs of the runtime's sampler over the graph and over torch."""
+    """Return the lowest PSNR, in dB, between runs of the runtime's sampler with the graphs and with torch."""
     lowest = math.inf
     for size, mode in product((grid.shape(1, 1), grid.shape(2, 3)), SPAN):
         condition = random_condition(*size, mode, seed=size[0])
@@ -74,13 +76,13 @@ def check_sampling(
 
 
 def run(graphs: mini.Graphs, feeds: Feeds) -> Array:
-    """The velocity that the two graphs compute for the inputs of one evaluation."""
+    """Return the velocity that the two graphs compute for one evaluation."""
     drawn, _ = graphs.branches(feeds)
     return graphs.velocity.run({"x": feeds["x"], "sigma": feeds["sigma"], **drawn})["velocity"]
 
 
 def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:
-    """The network's velocity in torch, as an array; ExportError where it is not finite."""
+    """Return the network's velocity in torch as an array. Raises ExportError if it is not finite."""
     with torch.inference_mode():
         velocity = network(**{name: torch.from_numpy(array) for name, array in feeds.items()}).numpy()
     if not np.isfinite(velocity).all():
@@ -89,13 +91,13 @@ def evaluate(network: torch.nn.Module, feeds: Feeds) -> Array:
 
 
 def relative_error(got: Array, want: Array) -> float:
-    """The largest difference in a batch, relative to the largest value of its own row."""
+    """Return the largest difference in a batch, relative to the largest value of its row."""
     rows = tuple(range(1, want.ndim))
     return float((np.abs(got - want).max(rows) / np.maximum(np.abs(want).max(rows), 1e-6)).max())
 
 
 def random_condition(height: int, width: int, mode: Mode, seed: int) -> Condition:
-    """A noisy photo with strokes of light up to about 5 over a fifth of it."""
+    """Return a noisy photo with strokes of light up to about 5 on a fifth of it."""
     rng = np.random.default_rng(seed)
     photo = rng.random((height, width, 3), dtype=np.float32)
     light = rng.exponential(1.0, (height, width, 3)).astype(np.float32)
@@ -104,7 +106,7 @@ def random_condition(height: int, width: int, mode: Mode, seed: int) -> Conditio
 
 
 def random_feeds(height: int, width: int, seed: int) -> Feeds:
-    """Inputs of one evaluation: a batch of both modes at every one of SIGMAS."""
+    """Return the inputs of one evaluation: a batch of both modes at each of SIGMAS."""
     cases = list(product(SPAN, SIGMAS))
     rows = [random_condition(height, width, mode, seed * len(cases) + i) for i, (mode, _) in enumerate(cases)]
     condition = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}

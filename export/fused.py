@@ -1,8 +1,7 @@
-"""Mini in operators that ONNX has whole: the same function in half as many nodes, which run faster on CPUs.
+"""Mini in larger ONNX operators: the same function in half as many nodes, which run faster on CPUs.
 
-Rotary positions and bringing vectors to a length are an operator each since opset 23, and a linear map
-whose answer is spread over finer cells is a transposed convolution. Attention has an operator as well, but
-OpenVINO lacks it.
+Since opset 23, rotary positions and normalising vectors are one operator each. A linear map whose output is
+spread over finer cells is a transposed convolution. Attention has an operator too, but OpenVINO lacks it.
 """
 
 from __future__ import annotations
@@ -18,15 +17,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.onnx import ops
 
-from dior_rt.training.network import LARGEST_LOGIT, Block, Features, Mini, Turns
+from dior_rt.training.network import LARGEST_LOGIT, Block, Features, Mini, Rotation
 
 OPSET: Final = 23
-TINIEST: Final = 1e-24  # a vector of zeros stays one
+TINIEST: Final = 1e-24  # keeps a vector of zeros
 
 
 def _log(x: Any) -> Any:
-    """The logarithm of a sum of one. ONNX Runtime takes Log in vectors, but the ends of every thread's share
-    one by one, which may differ in the last bit; this one is the same for any number of threads."""
+    """Return the logarithm as the log-sum of one number, which does not depend on the number of threads.
+
+    ONNX Runtime computes Log in vectors, but the ends of each thread's share one by one, which may differ
+    in the last bit.
+    """
     last: Any = opset23.Constant(value_ints=[-1])
     return opset23.ReduceLogSum(opset23.Unsqueeze(x, last), last, keepdims=0)
 
@@ -36,7 +38,7 @@ def _log1p(x: Any) -> Any:
     return _log(opset23.Add(x, one))
 
 
-#: How torch's exporter writes its operations, where not as it likes.
+#: Replacements for the way torch's exporter writes some operations.
 TRANSLATIONS: Final[dict[Callable, Callable]] = {
     torch.ops.aten.log.default: _log,
     torch.ops.aten.log1p.default: _log1p,
@@ -44,8 +46,8 @@ TRANSLATIONS: Final[dict[Callable, Callable]] = {
 
 
 def fused(network: Mini) -> Mini:
-    """A copy of the network whose `step` takes what `encode_fused` gives."""
-    other: Any = copy.deepcopy(network)  # some of its parts become parts of another kind
+    """Return a copy of the network whose `step` takes the output of `encode_fused`."""
+    other: Any = copy.deepcopy(network)  # some of its modules are replaced
     config = network.config
     other.blocks = nn.ModuleList(FusedBlock(block) for block in other.blocks)
     weight = other.unembed.weight.T.reshape(config.width, config.quarter, *2 * (config.patch // 4,))
@@ -59,8 +61,10 @@ def fused(network: Mini) -> Mini:
 
 
 def encode_fused(network: Mini, photo: Tensor, light: Tensor, mask: Tensor, own: Tensor) -> Features:
-    """The network's features, and in them the biases of what is divided: here each of the cells that come of
-    one has its own, and a transposed convolution has one for all of them."""
+    """Return the network's features, including the biases of divided cells.
+
+    Each of the finer cells has its own bias, but a transposed convolution has one bias for all of them.
+    """
     features = network.encode(photo, light, mask, own)
     factor = network.config.patch // 4
     return features._replace(
@@ -71,10 +75,11 @@ def encode_fused(network: Mini, photo: Tensor, light: Tensor, mask: Tensor, own:
 
 
 class FusedBlock(Block):
-    """A block in few operators. q, k and v are products of their own: nothing has to split them.
+    """A block in few operators. q, k and v are separate products, so nothing has to split them.
 
-    A root mean square of 1 / sqrt(d) is a length of 1. The bias of v goes on to the mean of all tokens' v as
-    it is, so that of `proj` takes it over."""
+    A root mean square of 1 / sqrt(d) is a length of 1. The mean over all tokens keeps the bias of v
+    unchanged, so the bias of `proj` includes it.
+    """
 
     of_q: Tensor
     of_k: Tensor
@@ -90,20 +95,20 @@ class FusedBlock(Block):
         self.register_buffer("of_k", torch.full((size,), 1 / math.sqrt(size)))
         self.proj = _linear(block.proj.weight, block.proj.bias + block.proj.weight @ bias)
 
-    def _attend(self, tokens: Tensor, turns: Turns) -> Tensor:
+    def _attend(self, tokens: Tensor, turns: Rotation) -> Tensor:
         q, k = self._turned(self.q(tokens), self.of_q, turns), self._turned(self.k(tokens), self.of_k, turns)
         q, k, v = (part.unflatten(2, (self.heads, -1)) for part in (q, k, self.v(tokens)))  # (B, N, H, d)
         mixed = (q.transpose(1, 2) @ k.permute(0, 2, 3, 1)).softmax(dim=-1) @ v.transpose(1, 2)
         return self.proj(mixed.transpose(1, 2).flatten(2))
 
-    def _turned(self, part: Tensor, weight: Tensor, turns: Turns) -> Tensor:
-        """Every head's vectors at the same length, turned; (B, N, width)."""
+    def _turned(self, part: Tensor, weight: Tensor, turns: Rotation) -> Tensor:
+        """Return every head's vectors, normalised and rotated, (B, N, width)."""
         heads = F.rms_norm(part.unflatten(2, (self.heads, -1)), weight.shape, weight, eps=TINIEST)
         return ops.rotary_embedding(heads.flatten(2), *turns, num_heads=self.heads)
 
 
 class Transposed(nn.Module):
-    """Cells become factor x factor finer ones each. weight: (from, to, factor, factor)."""
+    """Divide each cell into factor x factor finer ones. weight: (from, to, factor, factor)."""
 
     def __init__(self, weight: Tensor) -> None:
         super().__init__()
@@ -114,7 +119,7 @@ class Transposed(nn.Module):
 
 
 class FusedDivideTokens(nn.Module):
-    """The same of tokens; the linear map is in the weight."""
+    """Divide tokens into cells; the linear map is part of the weight."""
 
     def __init__(self, weight: Tensor) -> None:
         super().__init__()
@@ -133,6 +138,6 @@ def _linear(weight: Tensor, bias: Tensor | None) -> nn.Linear:
 
 
 def _tiled(bias: Tensor | None, factor: int, coarse: Tensor) -> Tensor:
-    """The biases (C * factor * factor,) of every cell that the cells of `coarse` become: (C, h, w)."""
+    """Return the biases (C * factor * factor,) for every finer cell of `coarse`, (C, h, w)."""
     assert bias is not None
     return bias.reshape(-1, factor, factor).repeat(1, *coarse.shape[2:])

@@ -1,4 +1,4 @@
-"""A LoRA merged into the weights it was trained on: W + (alpha / rank) B A. Nothing else of it remains."""
+"""Merge a LoRA into the weights it was trained on: W + (alpha / rank) B A."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ WEIGHTS: Final = "adapter_model.safetensors"
 
 
 def merge_lora(network: Network, folder: Path) -> Network:
-    """The network with peft's adapter in `folder` (adapter_config.json, adapter_model.safetensors) merged in.
+    """Return the network merged with the peft adapter in `folder`.
 
-    Raises InputError for an adapter that is missing, cut short, or made for another network.
+    The folder holds adapter_config.json and adapter_model.safetensors. Raises InputError for an adapter
+    that is missing, cut short, or made for another network.
     """
-    for name in (CONFIG, WEIGHTS):  # peft would look for what is missing on the net, and for pickles
+    for name in (CONFIG, WEIGHTS):  # peft would search the internet for missing files, and read pickles
         check_readable(folder / name, "LoRA")
     try:
         weights = load_file(folder / WEIGHTS)

@@ -1,6 +1,6 @@
-"""Mini to a bundle: torch's network becomes two ONNX graphs, their weights stored small, held to torch.
+"""Export mini: turn the torch network into two ONNX graphs with compact weights, and compare them with torch.
 
-"encode" is what photo and strokes say, whatever the flow's state; "velocity" is what every step costs.
+"encode" computes the features that do not depend on the flow time; "velocity" runs at every step.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ Weights = Literal["fp16", "fp32", "int8"]
 
 EXACT: Final = Bars(evaluation=1e-4, sampling=60.0)
 BARS: Final[dict[Weights, Bars]] = {"fp32": EXACT, "fp16": EXACT, "int8": Bars(evaluation=0.2, sampling=40.0)}
-LARGE: Final = 1024  # elements; smaller tensors stay float32, they weigh nothing
+LARGE: Final = 1024  # elements; smaller tensors stay float32
 
 
 @dataclass(frozen=True)
-class Recipe:
-    """How a network wants to be run; the fields are the manifest's."""
+class MiniExportConfig:
+    """How to run a network; the fields are those of the manifest."""
 
     name: str = "mini"
     grid: GridRule = field(default_factory=GridRule)
@@ -63,7 +63,7 @@ class Recipe:
     noise_scale: float = 1.0
 
 
-USUAL: Final = Recipe()
+USUAL: Final = MiniExportConfig()
 
 
 def export_checkpoint(
@@ -71,37 +71,37 @@ def export_checkpoint(
     out: Path,
     *,
     lora: Path | None = None,
-    recipe: Recipe = USUAL,
+    config: MiniExportConfig = USUAL,
     weights: Weights = "fp16",
     overwrite: bool = False,
 ) -> Bundle:
     """Write the bundle of a checkpoint at `out`.
 
-    checkpoint: a folder that training wrote, or its model.safetensors. lora: a folder of peft's to be
-    merged; of a checkpoint's folder it is lora/, where there is one. recipe: its grid's multiple is set to
-    the network's patch. Raises InputError for files that cannot be used, and what `export_network` raises.
+    checkpoint: a folder written by training, or its model.safetensors. lora: a peft folder to merge; by
+    default lora/ in the checkpoint's folder, if it exists. config: its grid's multiple is set to the
+    network's patch. Raises InputError for unusable files, and what `export_network` raises.
     """
     check_target(out, overwrite)
     if checkpoint.is_dir():
         checkpoint, lora = checkpoint / WEIGHTS, lora or _present(checkpoint / LORA)
     network = load_network(checkpoint)
-    recipe = replace(recipe, grid=replace(recipe.grid, multiple=network.config.patch))
+    config = replace(config, grid=replace(config.grid, multiple=network.config.patch))
     merged = merge_lora(network, lora) if lora else network
-    return export_network(merged, recipe, out, weights=weights, overwrite=overwrite)
+    return export_network(merged, config, out, weights=weights, overwrite=overwrite)
 
 
 def export_network(
-    network: Mini, recipe: Recipe, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
+    network: Mini, config: MiniExportConfig, out: Path, *, weights: Weights = "fp16", overwrite: bool = False
 ) -> Bundle:
     """Write a network's bundle at `out`.
 
-    weights: how they are stored; but for fp32 the network's own are rounded to float16 in place. The graphs
-    compute in float32, but for int8 with the matrix products in integers. Raises InputError for a recipe that
-    cannot be, ExportError where they compute something else than torch with the same weights, beyond
-    `BARS`, and BundleError where nothing can be written.
+    weights: how they are stored. Unless it is fp32, the network's weights are rounded to float16 in place.
+    The graphs compute in float32; with int8, matrix products use integers. Raises InputError for an invalid
+    config, ExportError if the graphs differ from torch with the same weights by more than `BARS`, and
+    BundleError if nothing can be written.
     """
     check_target(out, overwrite)
-    manifest, grid = describe(recipe, weights), recipe.grid
+    manifest, grid = describe(config, weights), config.grid
     network = network.eval()
     parity = {} if weights == "fp32" else {"weights_as_fp16": round_to_half(network, grid)}
     with tempfile.TemporaryDirectory() as scratch:
@@ -111,9 +111,9 @@ def export_network(
             files |= write_graph(part, name, Path(scratch), grid.multiple, weights)
         engines = {name: open_checked(files[f"{name}.onnx"]) for name in parts}
         found = mini.Graphs(**engines)
-        bars, sigmas = BARS[weights], recipe.schedule.sigmas(recipe.steps)
+        bars, sigmas = BARS[weights], config.schedule.sigmas(config.steps)
         parity["evaluation"] = check_evaluations(network, found, grid, bars)
-        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, recipe.guidance, bars)
+        parity["sampling_db"] = check_sampling(network, found, grid, sigmas, config.guidance, bars)
         graphs = {
             name: Graph(f"{name}.onnx", engine.inputs, engine.outputs, f"{name}.npz")
             for name, engine in engines.items()
@@ -122,8 +122,18 @@ def export_network(
         return write_bundle(out, manifest, files, overwrite=overwrite)
 
 
-class Encode(torch.nn.Module):
-    """A network's features of photo and strokes, by name."""
+class GraphPart(torch.nn.Module):
+    """A part of a network that becomes one graph. outputs: their names, in order."""
+
+    outputs: tuple[str, ...]
+
+    def feeds(self, height: int, width: int, seed: int) -> Feeds:
+        """Return random inputs by name, for a grid of that size."""
+        raise NotImplementedError
+
+
+class Encode(GraphPart):
+    """The part of the network that computes the features of photo and strokes."""
 
     outputs = Features._fields
 
@@ -142,8 +152,8 @@ class Encode(torch.nn.Module):
         return {name: feeds[name] for name in mini.SEEN} | {"own": own}
 
 
-class Step(torch.nn.Module):
-    """A network's velocity, from its features."""
+class Step(GraphPart):
+    """The part of the network that computes the velocity from the features."""
 
     outputs = ("velocity",)
 
@@ -173,12 +183,11 @@ class Step(torch.nn.Module):
         return {name: feeds[name] for name in ("x", "sigma", "mode")} | features
 
 
-def write_graph(
-    part: Encode | Step, name: str, folder: Path, multiple: int, weights: Weights
-) -> dict[str, Path]:
-    """Write one graph and its probe, a small evaluation and the right answers; returns the two files.
+def write_graph(part: GraphPart, name: str, folder: Path, multiple: int, weights: Weights) -> dict[str, Path]:
+    """Write one graph and its probe: a small evaluation with the expected outputs. Return the two files.
 
-    These are torch's; of int8 the CPU's, since a device has to be held to more than int8 keeps of torch's.
+    The expected outputs are torch's. For int8 they are the CPU's, because devices agree with each other
+    more closely than int8 agrees with torch.
     """
     graph, probe = folder / f"{name}.onnx", folder / f"{name}.npz"
     convert(part, graph, multiple)
@@ -193,8 +202,8 @@ def write_graph(
     return {graph.name: graph, probe.name: probe}
 
 
-def answers(part: Encode | Step, feeds: Feeds) -> dict[str, Array]:
-    """What torch computes, by the outputs' names; ExportError where it is not finite."""
+def answers(part: GraphPart, feeds: Feeds) -> dict[str, Array]:
+    """Return torch's outputs by name. Raises ExportError if they are not finite."""
     with torch.inference_mode():
         found = part(**{name: torch.from_numpy(array) for name, array in feeds.items()})
     arrays = dict(zip(part.outputs, [found] if isinstance(found, torch.Tensor) else found, strict=True))
@@ -203,16 +212,16 @@ def answers(part: Encode | Step, feeds: Feeds) -> dict[str, Array]:
     return {output: array.numpy() for output, array in arrays.items()}
 
 
-def convert(part: Encode | Step, path: Path, multiple: int) -> None:
+def convert(part: GraphPart, path: Path, multiple: int) -> None:
     """Write a part of the network as one portable ONNX graph, optimised, with its weights inside.
 
-    Batch, rows and columns are free; the grid's sides are multiples of `multiple`. Raises ExportError.
+    Batch, rows and columns vary; the grid's sides are multiples of `multiple`. Raises ExportError.
     """
     batch, rows, columns = Dim("batch", max=64), Dim("rows", max=256), Dim("columns", max=256)
     feeds = part.feeds(4 * multiple, 6 * multiple, seed=0)
 
     def shape(name: str, array: Array) -> dict[int, Any]:
-        """Free sides; a feature of 2 x 2 cells has half as many rows as the grid."""
+        """Return the variable sides. A feature of 2 x 2 cells has half as many rows as the grid."""
         if array.ndim < 4:
             return {0: batch}
         if name in ("cosine", "sine"):
@@ -238,14 +247,14 @@ def convert(part: Encode | Step, path: Path, multiple: int) -> None:
         except (torch.onnx.OnnxExporterError, RuntimeError, ValueError) as error:
             raise ExportError(f"The network cannot be written as an ONNX graph: {reason(error)}.") from error
     assert program is not None  # only the old exporter returns None
-    ClearMetadataAndDocStringPass()(program.model)  # it names the source files of this machine
+    ClearMetadataAndDocStringPass()(program.model)  # contains paths of this machine
     onnx_ir.save(program.model, path)
 
 
 def round_to_half(network: torch.nn.Module, grid: GridRule) -> float:
-    """Round the large weights to what float16 can hold, in place.
+    """Round the large weights to float16 values, in place.
 
-    Returns what that costs: the largest change of one evaluation, relative to its largest value.
+    Return the largest change of one evaluation, relative to its largest value.
     """
     feeds = random_feeds(*grid.shape(1, 1), seed=0)
     before = evaluate(network, feeds)
@@ -256,9 +265,12 @@ def round_to_half(network: torch.nn.Module, grid: GridRule) -> float:
 
 
 def multiply_in_int8(path: Path) -> None:
-    """Have a graph's matrix products take weights of 7 bits, a scale for each output, and activations of 8
-    bits, a scale for each call. With an 8th bit of weights, CPUs without VNNI would overflow in silence."""
-    logging.disable(logging.WARNING)  # advice to preprocess, which `convert` has done
+    """Change a graph's matrix products to weights of 7 bits and activations of 8 bits.
+
+    Weights have one scale per output, activations one per call. With 8-bit weights, CPUs without VNNI would
+    overflow without an error.
+    """
+    logging.disable(logging.WARNING)  # silences the advice to preprocess, which `convert` has done
     try:
         quantize_dynamic(
             path,
@@ -273,7 +285,7 @@ def multiply_in_int8(path: Path) -> None:
 
 
 def store_as_half(path: Path) -> None:
-    """Store the large weights of a graph as float16 wherever that loses nothing, and cast them on loading."""
+    """Store large weights as float16 where that is exact, and cast them when the graph is loaded."""
     model = onnx.load(path)
     casts = []
     for tensor in model.graph.initializer:
@@ -291,7 +303,7 @@ def store_as_half(path: Path) -> None:
 
 
 def open_checked(graph: Path) -> Engine:
-    """The graph in ONNX Runtime, after ONNX's own checker. Raises ExportError."""
+    """Check the graph with ONNX and open it in ONNX Runtime. Raises ExportError."""
     try:
         onnx.checker.check_model(graph, full_check=True)
     except (onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
@@ -299,27 +311,25 @@ def open_checked(graph: Path) -> Engine:
     return Engine(graph)
 
 
-def describe(recipe: Recipe, weights: Weights) -> Manifest:
-    """The manifest of an export, before its graph is made. Raises InputError for a recipe that cannot be."""
+def describe(config: MiniExportConfig, weights: Weights) -> Manifest:
+    """Return the manifest of an export before its graphs exist. Raises InputError for an invalid config."""
     try:
         return Manifest(
             family="mini",
-            name=recipe.name,
+            name=config.name,
             licence="Apache-2.0",
             precision=weights,
             files={},
             graphs={},
-            schedule=recipe.schedule,
-            steps=recipe.steps,
-            guidance=recipe.guidance,
-            colour="srgb",
-            grid=recipe.grid,
-            noise_scale=recipe.noise_scale,
+            schedule=config.schedule,
+            steps=config.steps,
+            guidance=config.guidance,
+            grid=config.grid,
+            noise_scale=config.noise_scale,
             parity={},
-            settings={},
         )
     except ValueError as error:
-        raise InputError(f"The model cannot be run so: {reason(error)}.") from error
+        raise InputError(f"The model cannot be run with these settings: {reason(error)}.") from error
 
 
 def _present(folder: Path) -> Path | None:
@@ -328,7 +338,7 @@ def _present(folder: Path) -> Path | None:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """torch.onnx speaks of packages that are not needed and of its own deprecations."""
+    """Silence torch.onnx, which warns of packages that are not needed and of its own deprecations."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)

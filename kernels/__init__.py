@@ -1,4 +1,4 @@
-"""The pixel kernels: OpenCL C, their host code, and a NumPy twin of each. Imported as ``dior_rt.kernels``.
+"""Pixel operations in OpenCL C and in NumPy. Imported as ``dior_rt.kernels``.
 
 ops = open_ops("auto")
 grid = ops.reduce_photo(photo, (64, 64))
@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from dior_rt.kernels.devices import (
-    Device,
     check_device,
     list_devices,
     open_device,
@@ -19,7 +18,7 @@ from dior_rt.kernels.devices import (
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
 from dior_rt.kernels.selftest import self_test
-from dior_rt.kernels.types import KernelError, Stroke, Strokes
+from dior_rt.kernels.types import Device, KernelError, Stroke, Strokes
 
 if TYPE_CHECKING:
     from dior_rt.kernels.opencl_ops import OpenCLOps as OpenCLOps
@@ -41,7 +40,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # pyopencl is loaded only by those who ask for OpenCL.
+    # Load pyopencl only when OpenCL is used.
     if name == "OpenCLOps":
         prepare_caches()
         from dior_rt.kernels.opencl_ops import OpenCLOps

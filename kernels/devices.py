@@ -1,4 +1,4 @@
-"""What OpenCL devices there are, and the choice among them. pyopencl is imported only on demand."""
+"""List the OpenCL devices and choose among them. pyopencl is imported only when needed."""
 
 from __future__ import annotations
 
@@ -6,30 +6,19 @@ import atexit
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
+import warnings
 from pathlib import Path
 from typing import Any
 
+from dior_rt.kernels.guard import GuardedOps
 from dior_rt.kernels.numpy_ops import NumpyOps
 from dior_rt.kernels.ops import Ops
-from dior_rt.kernels.probe import probe
+from dior_rt.kernels.probe import DeviceCrashError, probe
 from dior_rt.kernels.selftest import self_test
-from dior_rt.kernels.tested import TestedOps
-from dior_rt.kernels.types import KernelError
+from dior_rt.kernels.types import Device, KernelError
 
 #: The process that has OpenCL's driver in it, or None.
 _used_by: int | None = None
-
-
-@dataclass(frozen=True)
-class Device:
-    """An OpenCL device. index: its place in `list_devices()`; type: "gpu", "cpu", "accelerator", "other"."""
-
-    index: int
-    name: str
-    platform: str
-    type: str
-    handle: Any
 
 
 def list_devices() -> list[Device]:
@@ -41,6 +30,8 @@ def list_devices() -> list[Device]:
             "processes by the method 'spawn'"
         )
     prepare_caches()
+    # An older pyopencl beside a newer pytools says so on every import; nobody here can act on it.
+    warnings.filterwarnings("ignore", message="pytools.persistent_dict")
     try:
         import pyopencl as cl
     except ModuleNotFoundError as error:
@@ -66,7 +57,7 @@ def list_devices() -> list[Device]:
 
 
 def prepare_caches() -> None:
-    """Have PoCL and pyopencl keep what they compile in a folder that is writable and nobody else's.
+    """Make PoCL and pyopencl keep compiled kernels in a writable folder that belongs to this user.
 
     PoCL would use ~/.cache/pocl/kcache, have no device at all where that cannot be written, and, without a
     HOME, load code from /tmp/pocl, which anyone may have put there. The folder is this program's own, so that
@@ -92,10 +83,10 @@ def prepare_caches() -> None:
 
 
 def open_ops(name: str = "auto") -> Ops:
-    """The Ops of that name, see `open_device`; `reason` says why it was chosen.
+    """Return the Ops of that name. Its `reason` says why it was chosen.
 
     "numpy"; "opencl": the best OpenCL device; "opencl:<which>": the device of that index, or the first whose
-    name contains the text; "auto": a GPU or accelerator, else NumPy. Under "auto" a device that
+    name contains the text; "auto": a GPU, else another OpenCL device, else NumPy. Under "auto" a device that
     cannot be opened gives way to the next, and one that fails later to NumPy; the reason says so. Raises
     KernelError where what was named cannot be had."""
     if name == "numpy":
@@ -109,18 +100,18 @@ def open_ops(name: str = "auto") -> Ops:
     if which:
         devices = [device for device in devices if _answers_to(device, which)]
     if not devices:
-        raise KernelError(f"no OpenCL device answers to {name!r}")
+        raise KernelError(f"there is no OpenCL device {name!r}; `dior-rt devices` lists them")
     return open_device(devices[0])
 
 
-def open_device(device: Device, spare: Ops | None = None) -> TestedOps:
+def open_device(device: Device, spare: Ops | None = None) -> GuardedOps:
     """The Ops of a device. An operation is tried before its first use; where it fails, `spare` takes over.
 
     Raises KernelError if the device cannot be opened, or fails what every 8-bit photo needs first."""
     probe(device)
     from dior_rt.kernels.opencl_ops import OpenCLOps
 
-    return TestedOps(OpenCLOps(device), spare)
+    return GuardedOps(OpenCLOps(device), spare)
 
 
 def check_device(device: Device) -> None:
@@ -132,13 +123,12 @@ def check_device(device: Device) -> None:
 
 
 def by_preference(devices: list[Device]) -> list[Device]:
-    """GPUs first, then CPUs, then the rest; otherwise in the platforms' order."""
+    """Sort GPUs first, then CPUs, then the rest, each in the order of the platforms."""
     order = {"gpu": 0, "cpu": 1}
     return sorted(devices, key=lambda device: order.get(device.type, 2))
 
 
 def _choose_best() -> Ops:
-    """A GPU, else NumPy: see docs/bench.md for why a CPU has no need of OpenCL."""
     ops: Ops = NumpyOps()
     try:
         devices = by_preference(list_devices())
@@ -146,11 +136,12 @@ def _choose_best() -> Ops:
     except KernelError as error:
         devices, problems = [], [str(error)]
     for device in devices:
-        if device.type == "cpu":
-            problems.append(f"opencl:{device.index} is this CPU, where NumPy starts sooner")
-            continue
         try:
             tested = open_device(device, spare=ops)
+        except DeviceCrashError as error:
+            problems.append(str(error))
+            ops.notice = f"The pixel kernels run on NumPy: {error}."
+            continue
         except KernelError as error:
             problems.append(str(error))
             continue
@@ -163,7 +154,7 @@ def _choose_best() -> Ops:
 
 
 def _devices(platform: Any) -> list[Any]:
-    """A platform's devices; one that has none says so with an error."""
+    """Return a platform's devices. A platform without devices raises an error, so return none then."""
     import pyopencl as cl
 
     try:

@@ -1,4 +1,4 @@
-"""Brush strokes as capsules: what both rasterisers draw.
+"""Brush strokes as capsules: the shape that both rasterisers draw.
 
 The coverage of a pixel whose centre is at distance d from a stroke's centre line is, with r = max(width, 1)
 / 2,
@@ -6,10 +6,10 @@ The coverage of a pixel whose centre is at distance d from a stroke's centre lin
     t = clip((r + 1/2 - d) / (1 + softness * r), 0, 1)
     coverage = clip(width, 2^-60, 1) * (t + softness * (t^2 (3 - 2 t) - t))
 
-A hard edge is a ramp one pixel wide; a soft one falls smoothly from the centre line's neighbourhood to the
-border. A stroke thinner than a pixel is drawn a pixel wide and as much fainter. Strokes lie over one
-another in order: value * mask and mask are blended over, then the value is un-premultiplied, so it never
-darkens at an edge.
+A hard edge is a ramp one pixel wide. A soft edge falls smoothly from near the centre line to the border. A
+stroke thinner than a pixel is drawn one pixel wide and proportionally fainter. Later strokes lie over
+earlier ones: value * mask and mask are blended, then the value is un-premultiplied, so it never darkens at
+an edge.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from dior_rt.kernels.resample import FAINTEST
 from dior_rt.kernels.types import FloatArray, Stroke, Strokes
 
-#: Side of the square tiles for which segments are listed.
+#: Side in pixels of the square tiles for which segments are listed.
 TILE = 32
 #: The same for NumPy, which gains by small tiles what it loses by listing more of them.
 SMALL_TILE = 8
@@ -37,10 +37,10 @@ SEGMENT.names = ("ends", "radius", "softness", "strength", "stroke")
 
 
 def segments(stroke: Stroke, size: tuple[int, int]) -> FloatArray:
-    """(n, 4) float32: the ends x0, y0, x1, y1 of the stroke's segments; a dot is one of length 0.
+    """Return the ends x0, y0, x1, y1 of the stroke's segments, (n, 4) float32. A dot has length 0.
 
-    What lies too far from a picture of (H, W) pixels to touch it is cut away (Liang & Barsky, 1984), so that
-    an end anywhere leaves float32 its accuracy.
+    Parts too far from a picture of (H, W) pixels to touch it are cut away (Liang & Barsky, 1984), so that
+    distant ends do not cost float32 accuracy.
     """
     points = simplify(np.asarray(stroke.points, np.float64))
     if len(points) == 1:
@@ -48,7 +48,7 @@ def segments(stroke: Stroke, size: tuple[int, int]) -> FloatArray:
     start, way = points[:-1], np.diff(points, axis=0)
     low, high = -radius(stroke) - 1, np.array(size[::-1]) + radius(stroke) + 1
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Along each axis, the shares of the way at which it comes in and goes out.
+        # The fractions of the segment at which it enters and leaves the picture, along each axis.
         edges = np.sort(np.stack([(low - start) / way, (high - start) / way]), axis=0)
     inside = (start >= low) & (start <= high)
     edges = np.where(way == 0, np.where(inside, [[[0.0]], [[1.0]]], [[[1.0]], [[0.0]]]), edges)
@@ -77,12 +77,12 @@ def simplify(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 
 def radius(stroke: Stroke) -> float:
-    """Half the width that is drawn: at least half a pixel."""
+    """Return half the drawn width, at least half a pixel."""
     return max(stroke.width, 1.0) / 2
 
 
 def strength(stroke: Stroke) -> float:
-    """The coverage in the middle: less than 1 for what is thinner than a pixel."""
+    """Return the coverage in the middle: below 1 for a stroke thinner than a pixel."""
     return min(max(stroke.width, FAINTEST), 1.0)
 
 
@@ -97,7 +97,7 @@ def distance_squared(segment: FloatArray, x: FloatArray, y: FloatArray) -> Float
 
 
 def coverage(stroke: Stroke, distance: FloatArray) -> FloatArray:
-    """How much of a pixel is covered, by its distance from the centre line; see the module's equation."""
+    """Return how much of a pixel is covered, given its distance from the centre line."""
     r, soft = radius(stroke), stroke.softness
     t = np.clip((r + 0.5 - distance) / (1 + soft * r), 0, 1).astype(np.float32)
     smooth = t * t * (3 - 2 * t)
@@ -106,10 +106,11 @@ def coverage(stroke: Stroke, distance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Plan:
-    """Strokes laid out for a device: which segments may touch which tile of TILE x TILE pixels.
+    """Strokes prepared for a device: which segments may touch which tile of TILE x TILE pixels.
 
-    segments: one SEGMENT each; lights: (strokes, 4) float32, linear RGB and 1. The segments that may touch
-    tile t, row by row, are entries[first[t]:first[t + 1]], in the order of their strokes."""
+    segments: one SEGMENT each. lights: (strokes, 4) float32, linear RGB and 1. The segments that may touch
+    tile t (tiles in row order) are entries[first[t]:first[t + 1]], in the order of their strokes.
+    """
 
     segments: np.ndarray
     lights: FloatArray
@@ -118,7 +119,7 @@ class Plan:
 
 
 def plan(strokes: Sequence[Stroke], size: tuple[int, int]) -> Plan:
-    """At least one stroke, over a picture of (H, W) pixels."""
+    """Prepare at least one stroke for a picture of (H, W) pixels."""
     rows, columns = (-(-side // TILE) for side in size)
     parts, segment, tile, begun = [], [], [], 0
     for number, stroke in enumerate(strokes):

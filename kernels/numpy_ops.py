@@ -1,4 +1,4 @@
-"""The NumPy twin of every kernel: what runs where there is no OpenCL, and what OpenCL is compared against."""
+"""Every operation in NumPy: used without OpenCL, and as the reference of the self-tests."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA, rough_reciprocal
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
-#: Pixels in a band: what is worked on at a time stays in the processor's cache.
+#: Pixels in a band, so that a band stays in the processor's cache.
 BAND = 1 << 16
 MOST_THREADS = 16
 
 
 class NumpyOps(Ops):
-    """Vectorised NumPy, in bands of rows."""
+    """The operations in vectorised NumPy, in bands of rows."""
 
     name = "numpy"
 
@@ -102,7 +102,7 @@ class NumpyOps(Ops):
         row, down = spline_taps(height, nodes.shape[0] - 2)
         column, across = spline_taps(width, nodes.shape[1] - 2)
         whole = 1 if photo.dtype == np.float32 else np.iinfo(photo.dtype).max
-        # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane a quantity.
+        # (4, rows + 2, W), the nodes before, at and after each pixel's column: one plane per quantity.
         near_columns = [np.ascontiguousarray(np.moveaxis(nodes[:, column + m], 2, 0)) for m in range(3)]
 
         def work(rows: slice) -> None:
@@ -135,7 +135,7 @@ def each(work: Callable[[slice], None], parts: list[slice]) -> None:
 
 
 def _weighted(light: Picture, mask: Picture) -> FloatArray:
-    """(rows, W, 4): light * mask and mask, with 0 for the light that the mask leaves unspecified."""
+    """Return light * mask and mask, (rows, W, 4), with 0 for light that the mask leaves unspecified."""
     if mask.dtype != np.float32:
         mask = mask * np.float32(1 / np.iinfo(mask.dtype).max)
     linear = light if light.dtype == np.float32 else decode_table(light.dtype)[light]

@@ -1,8 +1,6 @@
-"""The kernels on an OpenCL device: what is launched, on which bands. Their arithmetic is in the .cl files."""
+"""Every operation on an OpenCL device: which kernels run on which bands. The .cl files compute."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,24 +13,21 @@ from dior_rt.kernels.resample import FAINTEST, bands, spline_taps
 from dior_rt.kernels.session import Session
 from dior_rt.kernels.sparsify import Discs, Lattice, spans
 from dior_rt.kernels.transfer import EPSILON, SIGMA
-from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
+from dior_rt.kernels.types import Device, FloatArray, Picture, Stroke, Strokes
 
-if TYPE_CHECKING:
-    from dior_rt.kernels.devices import Device
-
-#: How a sample's dtype is called in OpenCL C.
+#: The names of the sample dtypes in OpenCL C.
 SAMPLES = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}
-#: Pixels in a band: a few megabytes, and enough work to make a launch's cost vanish.
+#: Pixels in a band: a few megabytes, and enough work that the cost of a launch does not matter.
 BAND = 1 << 22
-#: Registers of pixels in a cell: of fewer, what the last of them has too much would cost more than a fifth.
+#: Below this many vector registers per cell, the partly filled last one wastes more than a fifth of the time.
 FEW = 4
 
 
 class OpenCLOps(Ops):
-    """The operations on one device. Safe to call from several threads."""
+    """The operations on one OpenCL device. Safe to call from several threads."""
 
     def __init__(self, device: Device) -> None:
-        """Raises KernelError if the device cannot be opened."""
+        """Open the device. Raises KernelError if that fails."""
         self._session = Session(device)
         self.name = self._session.name
 
@@ -54,9 +49,9 @@ class OpenCLOps(Ops):
             self._map(self._kernel("encode", dtype), linear, picture, table)
         return picture
 
-    def _map(self, kernel: cl.Kernel, given: np.ndarray, result: np.ndarray, *table: cl.Buffer) -> None:
+    def _map(self, kernel: cl.Kernel, buffers: np.ndarray, result: np.ndarray, *table: cl.Buffer) -> None:
         """Run an elementwise kernel from one array to another of the same shape."""
-        session, flat, out = self._session, given.reshape(-1), result.reshape(-1)
+        session, flat, out = self._session, buffers.reshape(-1), result.reshape(-1)
         for band in bands(flat.size, 1, BAND):
             size = band.stop - band.start
             with session.output(out[band]) as buffer:
@@ -71,7 +66,7 @@ class OpenCLOps(Ops):
         if light.dtype == mask.dtype == np.float32:
             kernel = self._kernel("sum_strokes")
         else:
-            # The floats of strokes are linear already.
+            # Strokes in float are linear already.
             types = {
                 "LIGHT": SAMPLES[light.dtype.name],
                 "DECODE_LIGHT": "" if light.dtype == np.float32 else "DECODE",
@@ -92,14 +87,14 @@ class OpenCLOps(Ops):
     ) -> Strokes:
         session, (height, width), (rows, columns) = self._session, size, grid
         result = Strokes(np.empty((*grid, 3), np.float32), np.empty(grid, np.float32))
-        # A photo is summed by samples, strokes by pixels.
+        # Photos are summed by samples, strokes by pixels.
         count = width * 3 if channels == 3 else width
         sums = session.scratch(rows * width * channels * 4)
         session.clear(sums)
         for band in bands(height, width, BAND):
-            given = [session.input(picture[band]) for picture in pictures]
+            buffers = [session.input(picture[band]) for picture in pictures]
             session.launch(
-                kernel, count, rows, *given, table, sums, count, height, rows, band.start, band.stop
+                kernel, count, rows, *buffers, table, sums, count, height, rows, band.start, band.stop
             )
         mean_cells = self._kernel("mean_cells")
         with session.output(result.light) as light, session.output(result.mask) as specified:
@@ -113,22 +108,22 @@ class OpenCLOps(Ops):
             return result
         plan, columns = draw.plan(strokes, size), -(-width // draw.TILE)
         kernel = self._kernel("draw")
-        given = [session.input(array) for array in (plan.segments, plan.lights, plan.first, plan.entries)]
+        buffers = [session.input(array) for array in (plan.segments, plan.lights, plan.first, plan.entries)]
         for band in bands(height, width, BAND):
             with session.output(result.light[band]) as light, session.output(result.mask[band]) as mask:
                 session.launch(
-                    kernel, columns, band.stop - band.start, *given, light, mask, width, columns, band.start
+                    kernel, columns, band.stop - band.start, *buffers, light, mask, width, columns, band.start
                 )
         return result
 
     def _coarsen(self, lumi: FloatArray, lattice: Lattice) -> Strokes:
         session, (height, width), (rows, columns) = self._session, lumi.shape[:2], lattice.keep.shape
         result = Strokes(np.empty(lumi.shape, np.float32), np.empty((height, width), np.float32))
-        given = session.input(lumi), session.input(lattice.keep.astype(np.uint8))
+        buffers = session.input(lumi), session.input(lattice.keep.astype(np.uint8))
         place = lattice.cell, lattice.oy, lattice.ox
         with session.output(result.light) as light, session.output(result.mask) as mask:
             kernel = self._kernel("coarsen")
-            session.launch(kernel, columns, rows, *given, light, mask, height, width, *place, columns)
+            session.launch(kernel, columns, rows, *buffers, light, mask, height, width, *place, columns)
         return result
 
     def _cut(self, lumi: FloatArray, discs: Discs) -> Strokes:
@@ -151,17 +146,17 @@ class OpenCLOps(Ops):
         narrow = width < columns * session.lanes * FEW
         kernel = self._kernel("transfer_narrow" if narrow else "transfer", photo.dtype)
         light = _by_pixel(nodes, width) if narrow else (nodes,)
-        given = [*map(session.input, light), *tables]
+        buffers = [*map(session.input, light), *tables]
         count, sides = (width, ()) if narrow else (columns, (columns,))
         for band in bands(height, width, BAND):
             with session.output(result[band]) as out:
                 place = height, width, rows, *sides, band.start
                 taken = session.input(photo[band])
-                session.launch(kernel, count, band.stop - band.start, taken, *given, out, *place)
+                session.launch(kernel, count, band.stop - band.start, taken, *buffers, out, *place)
         return result
 
     def _kernel(self, name: str, dtype: npt.DTypeLike = np.uint8, **defines: str) -> cl.Kernel:
-        """A kernel for samples of that dtype; strokes are floats unless `defines` says otherwise."""
+        """Return a kernel for samples of that dtype. Strokes are floats unless `defines` says otherwise."""
         kind = np.dtype(dtype)
         macros = {
             "SAMPLE": SAMPLES[kind.name],
@@ -191,13 +186,15 @@ class OpenCLOps(Ops):
 
 
 def _by_pixel(nodes: FloatArray, width: int) -> tuple[FloatArray, FloatArray]:
-    """Of every pixel of a row the nodes before, at and after it, (rows + 2, 3, 4, width), and the weights of
-    these three, (3, width)."""
+    """Return the nodes before, at and after every pixel of a row, and their weights.
+
+    Shapes: (rows + 2, 3, 4, width) and (3, width).
+    """
     column, across = spline_taps(width, nodes.shape[1] - 2)
     planes = np.ascontiguousarray(nodes.transpose(0, 2, 1))  # (rows + 2, 4, columns + 2)
     return np.stack([planes.take(column + m, axis=2) for m in range(3)], 1), across
 
 
 def _whole(dtype: np.dtype) -> str:
-    """What stands for 1 in samples of that dtype."""
+    """Return the value that represents 1 in samples of that dtype, as OpenCL C."""
     return "1.0f" if dtype == np.float32 else f"{np.iinfo(dtype).max}.0f"

@@ -1,4 +1,4 @@
-"""Ops: the pixel work of the runtime. One set of checks and meanings; a subclass a way to compute."""
+"""Ops: the pixel operations, with their definitions and checks. Subclasses compute them."""
 
 from __future__ import annotations
 
@@ -19,28 +19,30 @@ Dtype = npt.DTypeLike
 
 
 class Ops(ABC):
-    """The operations, defined once. Every method raises ValueError where a shape, dtype or option is wrong.
+    """The operations. Every method raises ValueError for a wrong shape, dtype or option.
 
     Pictures are uint8, uint16 or float32, sRGB-encoded; integers span 0..1 over their whole range. Light is
-    float32 and linear; 1.0 is display white. Arrays need not be contiguous; results are, and are always
-    new.
+    float32 and linear; 1.0 is display white. Arrays need not be contiguous. Results are contiguous and
+    always new.
 
-    name: what computes. reason: why it was chosen, one sentence.
+    name: the device that computes. reason: why it was chosen, in one sentence. notice: what the user should
+    know of the choice, one sentence or "".
     """
 
     name: str
-    reason: str = "it was asked for"
+    reason: str = "it was requested"
+    notice: str = ""
 
     def decode_srgb(self, picture: Picture) -> FloatArray:
-        """sRGB -> linear, any shape. Floats outside 0..1 follow the curve's own extension; NaN stays NaN."""
+        """Convert sRGB to linear, any shape. Floats outside 0..1 follow the extended curve; NaN stays NaN."""
         picture = np.asarray(picture)
         _check_dtype("picture", picture)
         return self._decode(picture)
 
     def encode_srgb(self, linear: FloatArray, dtype: Dtype) -> Picture:
-        """Linear float32 of any shape -> sRGB of `dtype`.
+        """Convert linear float32 of any shape to sRGB of `dtype`.
 
-        Integers are the nearest code, exactly, of the value clipped to 0..1; NaN becomes 0. Floats are not
+        Integers are exactly the nearest code of the value clipped to 0..1; NaN becomes 0. Floats are not
         clipped.
         """
         linear, wanted = np.asarray(linear), np.dtype(dtype)
@@ -51,18 +53,19 @@ class Ops(ABC):
         return self._encode(linear, wanted)
 
     def reduce_photo(self, picture: Picture, grid: Grid) -> FloatArray:
-        """(H, W, 3) sRGB -> (h, w, 3) linear: the mean over the exact area of each cell, in linear light."""
+        """Reduce sRGB (H, W, 3) to linear (h, w, 3): the mean over the exact area of each cell, in linear
+        light."""
         picture = np.asarray(picture)
         _check_dtype("picture", picture)
         _check_pixels("picture", picture, channels=3)
         return self._reduce_photo(picture, _check_size(grid))
 
     def reduce_strokes(self, light: Picture, mask: Picture, grid: Grid) -> Strokes:
-        """Full-size strokes -> strokes of the grid: the mean of light, weighted by mask and exact overlap.
+        """Reduce full-size strokes to the grid: the mean of light, weighted by mask and exact overlap.
 
-        light (H, W, 3): integers are sRGB-encoded, floats linear. mask (H, W): integers span 0..1; it must
-        lie in 0..1, and counts as at least 2^-60 where it is not 0. Light where the mask is 0 is never read
-        into a result. The new mask is 1 in each cell that anything specified touches, else 0.
+        light (H, W, 3): integers are sRGB-encoded, floats linear. mask (H, W), in 0..1: integers span
+        that range, and values that are not 0 count as at least 2^-60. Light where the mask is 0 never
+        enters a result. The new mask is 1 in each cell that a specified pixel touches, else 0.
         """
         light, mask = np.asarray(light), np.asarray(mask)
         _check_dtype("light", light)
@@ -74,20 +77,23 @@ class Ops(ABC):
         return self._reduce_strokes(light, mask, _check_size(grid))
 
     def draw_strokes(self, strokes: Sequence[Stroke], size: Grid) -> Strokes:
-        """Rasterise strokes, later ones over earlier ones; see `dior_rt.kernels.draw` for the equation."""
+        """Rasterise strokes, later ones over earlier ones. `dior_rt.kernels.draw` has the equation."""
         return self._draw_strokes(list(strokes), _check_size(size))
 
     def sparsify(
         self, lumi: FloatArray, mode: Mode, seed: int, interest: FloatArray | None = None
     ) -> Strokes:
-        """What a person might have drawn of a dense Lumi map (H, W, 3); the mask is 0 or 1, and never 0
-        everywhere.
+        """Return the part of a dense Lumi map (H, W, 3) that a person might have drawn.
 
-        "dense": all of it. "strokes": one to eight freehand strokes, under which a pixel keeps its own
-        value; they start by turns in bright and in dark regions, or in proportion to `interest` (H, W) >= 0
-        where it is not 0 everywhere. "coarse": the map at a random coarser resolution, of which a random
-        share of the cells is dropped; a cell holds the mean of its pixels. One seed (an int >= 0) gives one
-        mask, bit for bit, on every device.
+        The mask is 0 or 1, and never 0 everywhere. A seed (an int >= 0) gives the same mask on every device,
+        bit for bit. The modes are
+
+            dense    everything
+            strokes  one to eight freehand strokes, under which each pixel keeps its value. They start
+                     alternately in bright and dark regions, or in proportion to `interest` (H, W) >= 0 unless
+                     that is 0 everywhere
+            coarse   the map at a random coarser resolution, without a random share of the cells; a cell holds
+                     the mean of its pixels
         """
         lumi = np.asarray(lumi)
         if lumi.dtype != np.float32:
@@ -108,12 +114,12 @@ class Ops(ABC):
         return self._cut(lumi, draw_walks(lumi, seed, interest))
 
     def transfer(self, photo: Picture, source: FloatArray, relit: FloatArray) -> Picture:
-        """The photo (H, W, 3) under the light that turns the grid `source` into `relit`, in the photo's own
+        """Return the photo (H, W, 3) under the light that turns the grid `source` into `relit`, in its own
         dtype.
 
-        source, relit: (h, w, 3) float32, linear, finite, >= 0; source is `reduce_photo` of the photo. Where
-        they are equal an integer photo comes back unchanged, bit for bit. See `dior_rt.kernels.transfer`
-        for the equation.
+        source, relit: (h, w, 3) float32, linear, finite, >= 0. source is `reduce_photo` of the photo. Where
+        the grids are equal, an integer photo is returned unchanged, bit for bit. `dior_rt.kernels.transfer`
+        has the equation.
         """
         photo, source, relit = np.asarray(photo), np.asarray(source), np.asarray(relit)
         _check_dtype("photo", photo)
@@ -161,7 +167,7 @@ def _check_dtype(name: str, array: np.ndarray) -> None:
 def _check_pixels(
     name: str, array: np.ndarray, channels: int | None = None, size: tuple[int, ...] | None = None
 ) -> None:
-    """Raise unless the array is (H, W, channels), or (H, W) where channels is None, with no side of 0."""
+    """Raise unless the array is (H, W, channels), or (H, W) for channels None, and not empty."""
     wanted = "(H, W)" if channels is None else f"(H, W, {channels})"
     fits = array.ndim == 2 if channels is None else array.ndim == 3 and array.shape[2] == channels
     if not fits or array.size == 0:

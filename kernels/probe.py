@@ -28,6 +28,10 @@ _CODE = "import sys; from dior_rt.kernels.probe import try_device; try_device(in
 _INSIDE = "DIOR_RT_PROBE"
 
 
+class DeviceCrashError(KernelError):
+    """A device whose driver ends the process that uses it."""
+
+
 def probe(device: Device) -> None:
     """Raise KernelError where a device cannot be used without danger; what crashes it is cleared once."""
     if (
@@ -51,7 +55,7 @@ def probe(device: Device) -> None:
             with contextlib.suppress(OSError):
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    raise KernelError(f"opencl:{device.index} ({device.name}) ends the process that uses it ({how})")
+    raise DeviceCrashError(f"opencl:{device.index} ({device.name}) ends the process that uses it ({how})")
 
 
 def try_device(index: int) -> None:

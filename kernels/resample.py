@@ -1,4 +1,4 @@
-"""Exact area resampling: how much of each input pixel an output cell covers, along one axis."""
+"""Exact area resampling along one axis: how much of each input pixel an output cell covers."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import numpy as np
 
 from dior_rt.kernels.types import FloatArray
 
-#: What a fainter mask counts as: sums of light weighted by it stay normal numbers, on every device.
+#: Fainter masks count as this, so that sums weighted by them stay normal numbers on every device.
 FAINTEST = 2.0**-60
 
 
 def bands(height: int, width: int, pixels: int) -> Iterator[slice]:
-    """Slices of rows, in order, of about `pixels` pixels each and at least one row: memory stays bounded."""
+    """Yield slices of at least one row and about `pixels` pixels, in order, so that memory stays bounded."""
     rows = max(1, pixels // width)
     for top in range(0, height, rows):
         yield slice(top, min(height, top + rows))
 
 
 def area_weights(pixels: int, cells: int) -> FloatArray:
-    """(cells, pixels) float32: the share of cell i that pixel j fills. Every row sums to 1.
+    """Return the share of cell i that pixel j fills, (cells, pixels) float32. Every row sums to 1.
 
     Cell i spans [i, i + 1) * pixels / cells. The overlaps are computed in units of 1 / cells, as integers, so
-    a pixel that a cell does not touch weighs exactly 0.
+    the weight of a pixel that a cell does not touch is exactly 0.
     """
     cell = np.arange(cells, dtype=np.int64)[:, None] * pixels
     pixel = np.arange(pixels, dtype=np.int64)[None, :] * cells
@@ -32,9 +32,9 @@ def area_weights(pixels: int, cells: int) -> FloatArray:
 
 
 def spline_taps(pixels: int, cells: int) -> tuple[np.ndarray, FloatArray]:
-    """The cell that each pixel's centre lies in, and the quadratic B-spline's weights of the cells around it.
+    """Return the cell of each pixel's centre, and the quadratic B-spline weights of the cells around it.
 
-    (pixels,) integers, and (3, pixels) float32 for the cell before, the cell itself, the one after.
+    Shapes: (pixels,) integers; (3, pixels) float32 for the cell before, the cell itself and the one after.
     """
     centre = (2 * np.arange(pixels, dtype=np.int64) + 1) * cells
     cell = centre // (2 * pixels)

@@ -1,4 +1,4 @@
-"""An opened OpenCL device: its programs, its buffers, how a kernel is launched. Knows nothing of pictures."""
+"""An opened OpenCL device: programs, buffers and launches. It contains nothing about pictures."""
 
 from __future__ import annotations
 
@@ -8,26 +8,23 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import numpy as np
 import pyopencl as cl
 
-from dior_rt.kernels.types import KernelError
-
-if TYPE_CHECKING:
-    from dior_rt.kernels.devices import Device
+from dior_rt.kernels.types import Device, KernelError
 
 FOLDER = Path(__file__).parent
 SOURCES = ("curve.cl", "reduce.cl", "transfer.cl", "draw.cl", "sparsify.cl")
 P = ParamSpec("P")
 T = TypeVar("T")
-#: How many neighbours one work item takes on a CPU.
+#: How many neighbours one work item processes on a CPU.
 CPU_RUN = 4096
 
 
 def _translated(method: Callable[P, T]) -> Callable[P, T]:
-    """The method, raising KernelError, one sentence, for what OpenCL reports."""
+    """Return the method, with errors of OpenCL turned into a KernelError of one sentence."""
 
     @wraps(method)
     def translated(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -41,18 +38,18 @@ def _translated(method: Callable[P, T]) -> Callable[P, T]:
 
 
 class Session:
-    """Safe to use from several threads: each has its own kernels, and what they share is behind a lock.
+    """An opened device, safe to use from several threads: each has its own kernels; a lock guards the rest.
 
-    Where the device shares the host's memory, buffers are the arrays themselves and nothing is copied.
+    If the device shares the host's memory, the buffers are the arrays themselves and nothing is copied.
     """
 
     def __init__(self, device: Device) -> None:
-        """Programs are built when first needed. Raises KernelError if the device cannot be opened."""
+        """Open the device. Programs are built when first needed. Raises KernelError if opening fails."""
         self.name = f"opencl:{device.index} ({device.name})"
         try:
             self._context = cl.Context([device.handle])
             self._queue = cl.CommandQueue(self._context)
-            #: Floats that the device handles at a time.
+            #: How many floats the device processes at a time.
             self.lanes = max(1, min(16, device.handle.preferred_vector_width_float))
             self._shares_memory = bool(device.handle.host_unified_memory)
         except cl.Error as error:
@@ -65,7 +62,7 @@ class Session:
 
     @_translated
     def kernel(self, name: str, **defines: object) -> cl.Kernel:
-        """The kernel of that name, of the program that is built with -Dkey=value for each of `defines`.
+        """Return the kernel of that name, from the program built with -Dkey=value for each of `defines`.
 
         All sources make one program, for a build costs a quarter of a second and more sources hardly
         anything."""
@@ -87,19 +84,21 @@ class Session:
         return kernels[name, options]
 
     def _kernels_of_thread(self) -> dict[tuple[str, tuple[str, ...]], cl.Kernel]:
-        """A kernel keeps its arguments, so every thread has its own. To make one takes a millisecond."""
+        """Return the kernels of this thread. A kernel stores its arguments, and making one takes a
+        millisecond."""
         if not hasattr(self._local, "kernels"):
             self._local.kernels = {}
         return self._local.kernels
 
     @_translated
     def launch(self, kernel: cl.Kernel, count: int, rows: int, *args: cl.Buffer | int | None) -> None:
-        """Run the kernel over `rows` rows of `count` things and wait, so that no buffer need outlive the
+        """Run the kernel over `rows` rows of `count` items and wait, so that no buffer has to outlive the
         call.
 
-        One work item takes up to `run` neighbours on a row; the kernel gets `run` as its last argument. A CPU
-        wants few, long loops and work groups of one item (PoCL compiles a kernel anew for every shape of a
-        group); a GPU wants many items. None is a null pointer."""
+        One work item processes up to `run` neighbours on a row; the kernel gets `run` as its last argument.
+        CPUs need few, long loops and work groups of one item, because PoCL compiles a kernel again for
+        every shape of group. GPUs need many items. None is a null pointer.
+        """
         items = -(-count // self._run), rows
         group = (1, 1) if self._run > 1 else None
         for place, arg in enumerate((*args, self._run)):
@@ -108,7 +107,7 @@ class Session:
 
     @_translated
     def constant(self, array: np.ndarray) -> cl.Buffer:
-        """A copy of an array that lives as long as the session, once for each array."""
+        """Return a copy of an array on the device. It lives as long as the session and is made once."""
         with self._lock:
             if id(array) not in self._constants:
                 flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
@@ -117,7 +116,7 @@ class Session:
 
     @_translated
     def scratch(self, size: int) -> cl.Buffer:
-        """An uninitialised buffer of `size` bytes on the device."""
+        """Return an uninitialised buffer of `size` bytes on the device."""
         return cl.Buffer(self._context, cl.mem_flags.READ_WRITE, size)
 
     @_translated
@@ -127,15 +126,15 @@ class Session:
 
     @_translated
     def input(self, array: np.ndarray) -> cl.Buffer:
-        """The array as the device sees it; the array itself if it is contiguous and the memory is shared."""
+        """Return a buffer with the array: the array itself if it is contiguous and the memory is shared."""
         share = cl.mem_flags.USE_HOST_PTR if self._shares_memory else cl.mem_flags.COPY_HOST_PTR
         return cl.Buffer(self._context, cl.mem_flags.READ_ONLY | share, hostbuf=np.ascontiguousarray(array))
 
     @contextmanager
     def output(self, array: np.ndarray) -> Iterator[cl.Buffer]:
-        """A buffer for kernels to fill; when the block ends, the contiguous array holds what they wrote.
+        """Yield a buffer for kernels to fill. When the block ends, the contiguous array holds the result.
 
-        What they do not write is undefined where the device has its own memory.
+        If the device has its own memory, elements that the kernels do not write are undefined.
         """
         buffer = self._share(array) if self._shares_memory else self.scratch(array.nbytes)
         yield buffer
@@ -150,7 +149,7 @@ class Session:
         if not self._shares_memory:
             cl.enqueue_copy(self._queue, array, buffer)
             return
-        # Mapping is what makes the host see a shared buffer; where memory is really shared it copies nothing.
+        # The host sees a shared buffer only after mapping it. Mapping shared memory copies nothing.
         mapped, _ = cl.enqueue_map_buffer(
             self._queue, buffer, cl.map_flags.READ, 0, array.shape, array.dtype, strides=array.strides
         )

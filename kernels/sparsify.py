@@ -1,8 +1,8 @@
-"""Choosing which part of a dense Lumi map a person would have drawn.
+"""Choose which part of a dense Lumi map a person might have drawn.
 
-Only the host draws random numbers, all of them uniform doubles of PCG64, and what it decides (a lattice of
-cells, a list of discs in sixteenths of a pixel) is turned into a mask by integer arithmetic alone. So one
-seed gives one mask, bit for bit, on every device.
+Only the host draws random numbers, as uniform doubles of PCG64. Integer arithmetic alone turns its choices
+(a lattice of cells, a list of discs in sixteenths of a pixel) into a mask. So a seed gives the same mask on
+every device, bit for bit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from dior_rt.kernels.types import FloatArray
 
-#: Units of a pixel in which the discs of a stroke are placed.
+#: Discs are placed in units of 1 / UNITS pixels.
 UNITS = 16
 MAX_STROKES = 8
 WIDTHS = (0.015, 0.08)  # of the shorter side
@@ -26,7 +26,7 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 @dataclass(frozen=True)
 class Lattice:
-    """Square cells of `cell` pixels, the first one cut off by (oy, ox); keep: (rows, columns) bool."""
+    """Square cells of `cell` pixels; (oy, ox) is cut off the first one. keep: (rows, columns) bool."""
 
     cell: int
     oy: int
@@ -35,7 +35,7 @@ class Lattice:
 
 
 def draw_lattice(height: int, width: int, seed: int) -> Lattice:
-    """A lattice of random coarseness and place, less a random share of its cells; one cell at least stays."""
+    """Return a lattice of random size and position that keeps a random share of its cells, at least one."""
     rng = np.random.Generator(np.random.PCG64(seed))
     cell = max(1, round(_log_uniform(rng.random(), CELLS) * min(height, width)))
     oy, ox = int(rng.random() * cell), int(rng.random() * cell)
@@ -46,10 +46,10 @@ def draw_lattice(height: int, width: int, seed: int) -> Lattice:
 
 @dataclass(frozen=True)
 class Discs:
-    """Overlapping discs that make up the strokes: centres x, y and radius, int64, in 1 / UNITS pixels.
+    """Overlapping discs that form the strokes: centres x, y and radius, int64, in 1 / UNITS pixels.
 
-    Pixel (i, j), whose centre is at (UNITS * j + UNITS / 2, UNITS * i + UNITS / 2), is drawn where the
-    squared distance to any disc's centre is at most its squared radius.
+    Pixel (i, j), whose centre is at (UNITS * j + UNITS / 2, UNITS * i + UNITS / 2), is drawn if its
+    squared distance to a disc's centre is at most the squared radius.
     """
 
     x: npt.NDArray[np.int64]
@@ -58,10 +58,10 @@ class Discs:
 
 
 def draw_walks(lumi: FloatArray, seed: int, interest: FloatArray | None) -> Discs:
-    """One to eight freehand strokes: random walks whose direction drifts, reflected at the borders.
+    """Return one to eight freehand strokes: random walks whose direction drifts, reflected at the borders.
 
-    They start, by turns, in the brightest and in the darkest third of the map by luminance; or, where
-    `interest` (H, W) >= 0 is given and not 0 everywhere, at pixels drawn in proportion to it.
+    They start alternately in the brightest and the darkest third of the map by luminance. If `interest` (H,
+    W) >= 0 is not 0 everywhere, they start at pixels drawn in proportion to it.
     """
     height, width = lumi.shape[:2]
     side = min(height, width)
@@ -73,13 +73,14 @@ def draw_walks(lumi: FloatArray, seed: int, interest: FloatArray | None) -> Disc
         radius = max(_log_uniform(wide, WIDTHS) * side, 1.0) / 2
         step = max(radius / 2, 0.5)
         steps = int(_log_uniform(long, LENGTHS) * side / step)
-        # The direction drifts by about a radian over a fifth of the shorter side, whatever the step.
+        # The direction drifts by about a radian per fifth of the shorter side, for any step.
         drift = (rng.random(steps) - 0.5) * np.sqrt(12 * step / (0.2 * side))
         angle = 2 * np.pi * heading + np.cumsum(drift)
         centre = np.array([start % width, start // width]) + 0.5
         path = np.cumsum(step * np.stack([np.cos(angle), np.sin(angle)], 1), 0) + centre
         path = _reflect(np.concatenate([centre[None], path]), np.array([width, height]))
-        # A centre may lie half a diagonal from the next pixel's: a smaller disc could miss them all.
+        # A centre may be half a diagonal from the nearest pixel centre: a smaller disc could miss all of
+        # them.
         least = 0.75
         walks.append(np.column_stack([path, np.full(steps + 1, max(radius, least))]))
     x, y, radius = np.rint(np.concatenate(walks).T * UNITS).astype(np.int64)
@@ -87,7 +88,7 @@ def draw_walks(lumi: FloatArray, seed: int, interest: FloatArray | None) -> Disc
 
 
 def spans(discs: Discs, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows of pixels that each disc fills: (row, first column, one past the last column), clipped, int64.
+    """Return the spans that each disc fills: (row, first column, one past the last column), clipped, int64.
 
     On the row at dy from the centre the half chord is floor(sqrt(radius^2 - dy^2)), which is exact here: the
     arguments are below 2^52, where the float64 square root of an integer never rounds up to the next integer.
@@ -106,10 +107,10 @@ def spans(discs: Discs, height: int, width: int) -> tuple[np.ndarray, np.ndarray
 def _starts(
     lumi: FloatArray, interest: FloatArray | None, draws: np.ndarray, bright_first: bool
 ) -> list[int]:
-    """Flat pixel numbers; draws (count, 2) are uniform in 0..1."""
+    """Return flat indices of start pixels. draws: (count, 2), uniform in 0..1."""
     if interest is not None and interest.any():
         total = np.cumsum(interest, dtype=np.float64)
-        # side="right" steps over pixels of interest 0, which do not raise the running total.
+        # side="right" skips pixels of interest 0, which do not raise the running total.
         found = np.searchsorted(total, draws[:, 0] * total[-1], side="right")
         return np.minimum(found, int(np.flatnonzero(interest)[-1])).tolist()
     luminance = (lumi @ LUMINANCE).ravel()
@@ -128,5 +129,5 @@ def _log_uniform(draw: float, between: tuple[float, float]) -> float:
 
 
 def _reflect(path: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Fold a path back into 0..size along each axis, as a mirror at the border would."""
+    """Reflect a path into 0..size along each axis."""
     return size - np.abs(path % (2 * size) - size)

@@ -1,4 +1,4 @@
-"""The words of the kernels: a stroke as drawn, strokes as a raster, and what goes wrong."""
+"""The types of the kernels: a drawn stroke, rasterised strokes, a device, and the error."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-#: Pixels: farther points and wider strokes are refused.
+#: In pixels: farther points and wider strokes are refused.
 FARTHEST = 1e9
 #: Times display white: stronger light is refused, since products of it leave float32's range.
 STRONGEST = 1e9
@@ -19,17 +19,27 @@ Picture = npt.NDArray[Any]  # uint8, uint16 or float32
 
 
 class KernelError(ValueError):
-    """A device that was asked for by name and is not there, or that computes wrong results."""
+    """A named device that is not available, or a device that computes wrong results."""
+
+
+@dataclass(frozen=True)
+class Device:
+    """An OpenCL device. index: its place in `list_devices()`; type: "gpu", "cpu", "accelerator", "other"."""
+
+    index: int
+    name: str
+    platform: str
+    type: str
+    handle: Any
 
 
 @dataclass(frozen=True)
 class Stroke:
-    """One pull of the brush: a polyline with round caps; a single point is a dot.
+    """One stroke of the brush: a polyline with round caps. A single point is a dot.
 
     points: ((x, y), ...) in pixels; (0, 0) is the upper left corner of the picture, (0.5, 0.5) the centre of
     its first pixel; points may lie outside. width: pixels, > 0. color: linear RGB. intensity: the light is
-    color * intensity, both >= 0. softness: the share of the half width over which the edge fades, 0 hard ..
-    1.
+    color * intensity, both >= 0. softness: the share of the half width over which the edge fades; 0 is hard.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -54,7 +64,7 @@ class Stroke:
 
     @property
     def light(self) -> tuple[float, ...]:
-        """The linear RGB that the stroke says falls here: color * intensity."""
+        """The drawn light in linear RGB: color * intensity."""
         return tuple(c * self.intensity for c in self.color)
 
 

@@ -24,6 +24,7 @@ from dior_rt.export.lora import merge_lora
 from dior_rt.families.mini import Mini, null
 from dior_rt.flow.sampler import Array, Condition, Velocity, draw_noise, guided, sample
 from dior_rt.training.network import LORA, WEIGHTS, load_network
+from tools.command import start
 
 CHECKPOINT = Path(__file__).parents[1] / "training/checkpoints/mini"
 
@@ -66,14 +67,14 @@ def eager() -> Callable[[Condition], Velocity]:
 
     @torch.inference_mode()
     def bind(condition: Condition) -> Velocity:
-        given = {name: torch.from_numpy(array) for name, array in condition.items()}
-        own = network.own_light(given["photo"])
-        features = network.encode(given["photo"], given["light"], given["mask"], own)
+        inputs = {name: torch.from_numpy(array) for name, array in condition.items()}
+        source = network.estimate_source(inputs["photo"])
+        features = network.encode(inputs["photo"], inputs["light"], inputs["mask"], source)
 
         @torch.inference_mode()
         def velocity(x: Array, sigma: float) -> Array:
             sigmas = torch.full((len(x),), sigma)
-            return network.step(torch.from_numpy(x), sigmas, given["mode"], *features).numpy()
+            return network.step(torch.from_numpy(x), sigmas, inputs["mode"], *features).numpy()
 
         return velocity
 
@@ -81,4 +82,4 @@ def eager() -> Callable[[Condition], Velocity]:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    start(main)

@@ -10,11 +10,12 @@ over the pairs."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from PIL import Image
 from skimage import data
 from skimage.filters import gaussian, threshold_otsu
@@ -23,6 +24,7 @@ from dior_rt.grid import GridRule
 from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA
+from tools.command import start
 
 Array = np.ndarray
 Method = Callable[[Array, Array, Array], Array]
@@ -203,8 +205,11 @@ def leak(method: Method) -> int:
     return worst
 
 
-def main() -> None:
-    pairs = [*(real_pairs(Path(sys.argv[1])) if len(sys.argv) > 1 else ()), *synthetic_pairs()]
+def main(
+    folder: Annotated[Path | None, typer.Argument(help="Real pairs, beside the synthetic ones.")] = None,
+) -> None:
+    """Compare ways to carry the light of a small grid over to a photo, as a Markdown table."""
+    pairs = [*(real_pairs(folder) if folder else ()), *synthetic_pairs()]
     kinds = list(dict.fromkeys(kind for kind, *_ in pairs))
     print("| method |", " | ".join(kinds), "| leak |")
     print("|---|" + "---|" * (len(kinds) + 1))
@@ -219,4 +224,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

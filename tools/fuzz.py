@@ -4,8 +4,8 @@
 
 An input is a sound file with some bytes changed, cut, doubled or removed. It must be read, or refused with a
 DiorError of one line, within ten seconds of the processor, and leave no file behind. Input number N of a kind
-is the same in every run with the same seed, so `--kinds photos --only N` repeats one. Work is done in processes
-of their own, since a library that crashes takes its process along.
+is the same in every run with the same seed, so `--kinds photos --only N` repeats one. Work is done in
+processes of their own, since a library that crashes takes its process along.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ import numpy as np
 import pyopencl as cl
 
 from dior_rt.kernels import OpenCLOps, list_devices
+from tools.command import start
 
 SIZE, GRID, REPEATS, LOOPS, CHAINS = (2000, 6000), (28, 80), 5, 400_000, 12
 MEGAPIXELS, LIGHT_GRID = (0.1, 0.2, 0.4, 0.8, 1.6, 3, 6, 12, 24, 48, 100), (52, 80)
@@ -40,6 +41,7 @@ def seconds(action: Callable[[], object]) -> float:
 
 
 def main() -> None:
+    """Measure what bounds the pixel kernels on this CPU."""
     device = next(device for device in list_devices() if device.type == "cpu")
     ops, context = OpenCLOps(device), cl.Context([device.handle])
     lanes, queue = device.handle.preferred_vector_width_float, cl.CommandQueue(context)
@@ -97,4 +99,4 @@ def by_size(ops: OpenCLOps) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -5,16 +5,18 @@ python -m tools.make_pictures [BUNDLE]
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from PIL import Image
 
 from dior_rt import Relighter
 from dior_rt.images.strokes import read_strokes
 from dior_rt.kernels import NumpyOps, Stroke
+from tools.command import start
 
 EXAMPLES = Path("examples")
 PICTURES = Path("docs/pictures")
@@ -48,7 +50,10 @@ def side_by_side(pictures: list[Image.Image]) -> Image.Image:
     return sheet
 
 
-def main(bundle: str | None = None) -> None:
+def main(
+    bundle: Annotated[Path | None, typer.Argument(help="The model [default: the one that ships].")] = None,
+) -> None:
+    """Make docs/pictures: before, strokes, after, for the example photos."""
     relighter = Relighter(bundle)
     PICTURES.mkdir(parents=True, exist_ok=True)
     for photo_name, strokes_name in PAIRS:
@@ -61,4 +66,4 @@ def main(bundle: str | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    start(main)

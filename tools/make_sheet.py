@@ -8,15 +8,18 @@ and those named. Each row: the photo with all three strokes on it, and relit und
 
 from __future__ import annotations
 
-import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from PIL import Image, ImageDraw
 
 from dior_rt import Relighter
+from dior_rt.errors import InputError
 from dior_rt.kernels import Stroke
+from tools.command import start
 
 SHEET = Path("docs/pictures/sheet.jpg")
 PACKAGED = (
@@ -64,15 +67,18 @@ def row(relighter: Relighter, path: Path) -> list[Image.Image]:
     return cells
 
 
-def main(named: list[str]) -> None:
+def main(
+    photos: Annotated[list[Path] | None, typer.Argument(help="More photos, below those of packages.")] = None,
+) -> None:
+    """Make docs/pictures/sheet.jpg: one warm, one blue and one dark stroke on each of some real photos."""
     paths = []
     for package, inside in PACKAGED:
         spec = find_spec(package)
         if spec is None or not spec.submodule_search_locations:
-            sys.exit(f"The package {package} is not there; see the first lines of {__file__}.")
+            raise InputError(f"The package {package} is not there; see the first lines of {__file__}.")
         paths.append(Path(spec.submodule_search_locations[0]) / inside)
     relighter = Relighter()
-    rows = [row(relighter, path) for path in [*paths, *map(Path, named)]]
+    rows = [row(relighter, path) for path in [*paths, *(photos or ())]]
     heights = [cells[0].height + GAP for cells in rows]
     sheet = Image.new("RGB", (4 * (SIZE[0] + GAP), sum(heights)), "white")
     for top, cells in zip(np.cumsum([0, *heights]), rows, strict=False):
@@ -82,7 +88,4 @@ def main(named: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except OSError as error:
-        sys.exit(f"The sheet cannot be made: {error}.")
+    start(main)

@@ -6,19 +6,19 @@ python -m tools.presets --renders held-out --find     # the cheapest that keep i
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from dior_rt.bench.cases import Case, from_renders, made_up
+from dior_rt.bench.cases import Case, made_up
 from dior_rt.bench.promise import Kept, find, keep, settings, write_presets
 from dior_rt.bench.tables import table
-from dior_rt.cli.extras import needs_extra
-from dior_rt.errors import DiorError, InputError
+from dior_rt.errors import InputError
+from dior_rt.extras import needs_extra
 from dior_rt.presets import PROMISES, read_presets
 from dior_rt.relight import Relighter
+from tools.command import start
 
 TOLERANCES = (0.5, 1.0, 2.0, 4.0)  # of 255
 
@@ -40,9 +40,10 @@ def main(
         raise InputError("Presets are measured of models that predict light on a grid.")
     chosen = _cases(renders, cases)
     if search:
-        found = find(relighter, chosen, lambda line: typer.echo(line, err=True))
-        relighter.bundle = write_presets(relighter.bundle, found)
-    presets = read_presets(relighter.bundle)
+        presets = find(relighter, chosen, lambda line: typer.echo(line, err=True))
+        write_presets(relighter.bundle, presets)
+    else:
+        presets = read_presets(relighter.bundle)
     ways = {name: settings(preset) for name, preset in presets.items()}
     ways |= {f"tolerance {level:g}/255": {"tolerance": level / 255} for level in TOLERANCES}
     with typer.progressbar(length=len(chosen), label="cases") as bar:
@@ -82,13 +83,11 @@ def _cases(renders: Path | None, count: int) -> list[Case]:
     cases = made_up(count)
     if renders is not None:
         with needs_extra("train"):
+            from dior_rt.training.data.bench_cases import from_renders
+
             cases += from_renders(renders, count)
     return cases
 
 
 if __name__ == "__main__":
-    try:
-        typer.run(main)
-    except DiorError as error:
-        typer.echo(f"dior-rt: {error}", err=True)
-        sys.exit(2)  # 1 is a broken promise
+    start(main)

@@ -1,7 +1,7 @@
 """One block of the released model's width, measured; and what follows from it for the whole model.
 
     python -m tools.qwen_blocks --side 512 --runs 3 --threads 2
-    python -m tools.qwen_blocks --precisions          (nothing is run: on paper only)
+    python -m tools.qwen_blocks --on-paper           (measure nothing)
 
 Writes a block with random weights in each precision, runs it in ONNX Runtime and in torch on the same inputs,
 in turn, and prints seconds, error and size. The projection multiplies: blocks x branches x steps for time,
@@ -10,7 +10,6 @@ blocks x bytes for memory. The figures for GPUs are arithmetic from their data s
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import tempfile
@@ -20,17 +19,20 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 import torch
+import typer
 
 from dior_rt.engine import Engine
+from dior_rt.errors import InputError
 from dior_rt.export.qwen.errors import block_inputs, empty_block, load_block, relative, run_block
 from dior_rt.export.qwen.graph import PRECISIONS, Precision
 from dior_rt.export.qwen.transformer import TransformerConfig, write_block
 from dior_rt.export.qwen.weights import Array
 from dior_rt.families.qwen.frame import fit_area
+from tools.command import start
 
 RELEASED: Final = TransformerConfig(
     in_channels=64,
@@ -51,6 +53,9 @@ FEW_STEPS: Final = 8  # of a few-step LoRA, which takes no guidance
 LIVE: Final = (
     12  # streams that a block holds at most: MLP before and after its GELU 4 each, in fp16 2, x, LayerNorm
 )
+
+
+USUAL: Final[tuple[Precision, ...]] = ("fp32", "int8", "int4")
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,7 @@ def measure(
     weights = RandomWeights(config, 0)
     block = load_block(config, weights, 0)
     feeds, inputs = block_inputs(config, block, seed=0, words=WORDS, sizes=tuple(sizes))
-    given, want = np.concatenate([feeds["text"], feeds["image"]]), run_block(block, inputs)
+    before, want = np.concatenate([feeds["text"], feeds["image"]]), run_block(block, inputs)
     measured = []
     with tempfile.TemporaryDirectory() as scratch:
         for precision in precisions:
@@ -129,7 +134,7 @@ def measure(
             for _ in range(runs):
                 here.append(seconds(partial(engine.run, feeds)))
                 torch_here.append(seconds(partial(run_block, block, inputs)))
-            error = relative(got - given, want - given)
+            error = relative(got - before, want - before)
             size = path.with_suffix(".data").stat().st_size
             measured.append(Measured(precision, median(here), median(torch_here), error, size))
             path.with_suffix(".data").unlink()
@@ -191,26 +196,30 @@ def reference_tokens(side: int) -> int:
     return 3 * (rows // 16) * (columns // 16)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure one block of the released model's width.")
-    parser.add_argument(
-        "--side", type=int, default=512, help="of the picture and its two references, in pixels"
-    )
-    parser.add_argument("--runs", type=int, default=3)
-    parser.add_argument("--threads", type=int)
-    parser.add_argument("--precisions", nargs="*", choices=PRECISIONS, default=["fp32", "int8", "int4"])
-    parser.add_argument("--json", type=Path, help="also write the figures there")
-    options = parser.parse_args()
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    rows, columns = (side // 16 for side in fit_area(options.side**2, 1, 1, 32))
-    asked = RELEASED, [(rows, columns)] * 3, options.runs, options.threads, options.precisions
-    measured = measure(*asked) if options.precisions else []
-    print(report(measured, options.side))
-    if options.json:
+def main(
+    side: Annotated[int, typer.Option(min=32, help="Of the picture and its references, in pixels.")] = 512,
+    runs: Annotated[int, typer.Option(min=1, help="Runs of each precision.")] = 3,
+    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads [default: all].")] = None,
+    precision: Annotated[
+        list[str] | None, typer.Option(help="May be repeated [default: fp32 int8 int4].")
+    ] = None,
+    only_paper: Annotated[bool, typer.Option("--on-paper", help="Measure nothing, only project.")] = False,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Also write the figures there.")] = None,
+) -> None:
+    """Measure one block of the released model's width, and project the whole model from it."""
+    if threads:
+        torch.set_num_threads(threads)
+    rows, columns = (length // 16 for length in fit_area(side**2, 1, 1, 32))
+    if unknown := set(precision or ()) - set(PRECISIONS):
+        raise InputError(f"There is no precision {min(unknown)!r}, only: {', '.join(PRECISIONS)}.")
+    asked = [name for name in PRECISIONS if name in (precision or USUAL)]
+    chosen: list[Precision] = [] if only_paper else asked
+    measured = measure(RELEASED, [(rows, columns)] * 3, runs, threads, chosen) if chosen else []
+    typer.echo(report(measured, side))
+    if json_file:
         text = json.dumps([asdict(one) for one in measured], indent=2)
-        options.json.write_text(text + "\n", encoding="utf-8")
+        json_file.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

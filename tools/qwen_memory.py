@@ -1,6 +1,6 @@
 """The memory that writing a transformer takes, against the number of its blocks.
 
-    python -m tools.qwen_memory --blocks 2 6 12
+    python -m tools.qwen_memory --blocks 2 --blocks 6 --blocks 12
 
 Makes random checkpoints of a wide transformer with a LoRA on every block, and writes their graphs, each in a
 process of its own whose peak is read at the end. What was there before, libraries above all, is taken off.
@@ -9,20 +9,21 @@ The peak is Linux's VmHWM: getrusage's would begin at that of the process that b
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import tempfile
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import torch
+import typer
 from safetensors.torch import save_file
 
-from dior_rt.export.qwen.graph import PRECISIONS, Precision
+from dior_rt.export.qwen.graph import Precision
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.export.qwen.transformer import TransformerConfig, write_transformer
 from dior_rt.export.qwen.weights import Checkpoint, Merged
+from tools.command import start
 
 HEADS: Final = 4
 HEAD: Final = 128
@@ -36,11 +37,11 @@ def peak(blocks: int, precision: Precision = "fp32") -> float:
         make_model(folder, blocks)
         # A process begun afresh: a copy of this one would start from this one's own peak.
         context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe(duplex=False)
-        process = context.Process(target=write, args=(folder, precision, theirs))
+        receiver, sender = context.Pipe(duplex=False)
+        process = context.Process(target=write, args=(folder, precision, sender))
         process.start()
-        theirs.close()
-        found = ours.recv()
+        sender.close()
+        found = receiver.recv()
         process.join()
     return float(found)
 
@@ -82,14 +83,14 @@ def held(figure: str) -> float:
     return next(int(line.split()[1]) for line in lines if line.startswith(f"{figure}:")) * 1024 / 1e6
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure the memory that an export takes.")
-    parser.add_argument("--blocks", type=int, nargs="+", default=[2, 6, 12])
-    parser.add_argument("--precision", choices=PRECISIONS, default="fp32")
-    options = parser.parse_args()
-    for blocks in options.blocks:
-        print(f"{blocks:3} blocks: {peak(blocks, options.precision):4.0f} MB", flush=True)
+def main(
+    blocks: Annotated[list[int] | None, typer.Option(help="May be repeated [default: 2 6 12].")] = None,
+    precision: Annotated[Precision, typer.Option(help="Of the blocks.")] = "fp32",
+) -> None:
+    """Measure the memory that an export takes, against the number of blocks."""
+    for count in blocks or (2, 6, 12):
+        typer.echo(f"{count:3} blocks: {peak(count, precision):4.0f} MB")
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

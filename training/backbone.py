@@ -10,7 +10,8 @@ from peft import LoraConfig, PeftModel, get_peft_model
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from dior_rt.training.network import LORA, WEIGHTS, decode_light, load_network, save_network
+from dior_rt.training.light import decode_lumi
+from dior_rt.training.network import LORA, WEIGHTS, load_network, save_network
 
 LORA_TARGETS: Final = ["qkv", "proj", "up", "down", "modulation", "unembed"]
 
@@ -45,7 +46,7 @@ class MiniLora:
         return batch
 
     def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
-        return resample(decode_light((x0 + 1) / 2), grid)
+        return resample(decode_lumi((x0 + 1) / 2), grid)
 
     def save(self, network: nn.Module) -> None:
         assert isinstance(network, PeftModel)

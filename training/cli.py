@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from dior_rt.cli.extras import needs_extra
 from dior_rt.errors import InputError
+from dior_rt.extras import needs_extra
 
 app = typer.Typer(no_args_is_help=True, help="Render scenes and train the network (needs dior-rt[train]).")
 
@@ -227,12 +227,51 @@ def synthbench(
         )
 
 
+@app.command()
+def realbench(
+    views: Annotated[Path, typer.Argument(help="Folder of rendered views of the test split.")],
+    out: Annotated[Path, typer.Option(help="Folder of the benchmark; what is there already is kept.")],
+    pairs: Annotated[int, typer.Option(min=1)] = 300,
+    seed: Annotated[int, typer.Option(min=0, help="Different seeds draw different lights.")] = 0,
+) -> None:
+    """Make RealBench: pairs of held-out views with one lamp changed, added or replaced, for `eval`."""
+    from dior_rt.training.evaluation.judges.realbench import Recipe, make_realbench
+
+    with typer.progressbar(length=pairs, label="pairs") as bar:
+        make_realbench(views, out, Recipe(pairs, seed), lambda done, total: bar.update(1))
+
+
+@app.command()
+def sheet(
+    bundle: Annotated[Path, typer.Argument(help="Folder of a bundle.")],
+    out: Annotated[Path, typer.Option(help="Folder for sheet.jpg and one picture for each idea.")],
+    steps: Annotated[int | None, typer.Option(min=1, help="Of the flow [default: the bundle's own].")] = None,
+) -> None:
+    """Render the photographer's sheet: the lighting ideas of docs/sheet on real photos."""
+    from dior_rt.training.evaluation.judges.sheet import make_sheet, read_ideas
+
+    with typer.progressbar(length=len(read_ideas()), label="ideas") as bar:
+        make_sheet(bundle, out, steps, progress=lambda done, total: bar.update(1))
+
+
 @app.command(name="eval")
 def evaluate(
     method: Annotated[Path, typer.Argument(help="Folder of a bundle, or of another method's pictures.")],
     benchmark: Annotated[
-        Path, typer.Argument(help="Renders that training has not seen, or SynthBench, MultiIllum, ReNe.")
+        Path,
+        typer.Argument(
+            help="Renders that training has not seen, or SynthBench, RealBench, MultiIllum, ReNe. "
+            "With --judges: the word photos, or a folder of photos, renders or pairs."
+        ),
     ],
+    judges: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="Judge the model in place of the benchmark: material, objects, form, identity, slope, far, "
+            "added, ratio; separated by commas.",
+        ),
+    ] = None,
     views: Annotated[int, typer.Option(min=1, help="How many pairs of each kind at most.")] = 80,
     dabs: Annotated[int, typer.Option(min=0, help="On renders: how many views the brush visits.")] = 10,
     steps: Annotated[int | None, typer.Option(min=1, help="Of the flow [default: the bundle's own].")] = None,
@@ -255,16 +294,22 @@ def evaluate(
     Pictures of another method are called {task}.png; a name that is missing is told.
     """
     from dior_rt.files import make_folder
+    from dior_rt.training.evaluation.judges.panel import judge, parse_judges
     from dior_rt.training.evaluation.methods import Settings
     from dior_rt.training.evaluation.report import as_json as to_json
     from dior_rt.training.evaluation.report import markdown, write_report
+    from dior_rt.training.evaluation.results import Example
     from dior_rt.training.evaluation.run import Plan, evaluate
 
     settings = Settings(steps, guidance, noise_scale, reach)
+    names = parse_judges(judges) if judges is not None else ()
+    examples: list[Example] = []
     if out:
         make_folder(out)  # now, rather than after the work
-    plan = Plan(views, dabs, lpips, photos)
-    evaluation, examples = evaluate(method, benchmark, settings, plan)
+    if names:
+        evaluation = judge(method, benchmark, names, settings, views)
+    else:
+        evaluation, examples = evaluate(method, benchmark, settings, Plan(views, dabs, lpips, photos))
     if out:
         write_report(out, evaluation, examples)
     typer.echo(to_json(evaluation) if as_json else markdown(evaluation))
@@ -306,12 +351,12 @@ def ablation(
     stage1 = replace(budget.stage1, steps=steps, batch=batch, precision=precision, seed=seed)
     lora = replace(budget.lora, steps=lora_steps, batch=batch, precision=precision, seed=seed + 1)
 
-    def tell(training: str, step: int, loss: float) -> None:
+    def show(training: str, step: int, loss: float) -> None:
         if step % 50 == 0:
             typer.echo(f"{training}: step {step}, loss {loss:.4f}", err=True)
 
     budget = replace(budget, stage1=stage1, lora=lora)
-    evaluation, examples = ablate(maps, held_out, renders, out, budget, tell)
+    evaluation, examples = ablate(maps, held_out, renders, out, budget, show)
     write_report(out, evaluation, examples)
     typer.echo(markdown(evaluation))
 

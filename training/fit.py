@@ -22,22 +22,15 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder
+from dior_rt.flow.schedule import shift_sigma
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.data.triplets import GRIDS, Batches, Grids, load_views
-from dior_rt.training.network import (
-    BOUNCED,
-    FLOOR,
-    RELIT_SCALE,
-    WEIGHTS,
-    Config,
-    Mini,
-    load_network,
-    save_network,
-    srgb_to_linear,
-)
+from dior_rt.training.light import FLOOR, RELIT_SCALE, log_floored, srgb_to_linear
+from dior_rt.training.network import BOUNCED, WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.state import Average, State
 
 STOPS: Final = 2.0  # by which drawn light is strengthened or dimmed to see what it does
+LEAST_SIGMA: Final = 0.02  # smallest flow time that is drawn
 STATE: Final = "state.safetensors"  # what a run resumes from
 
 Progress = Callable[[int, float], None]  # step, running loss
@@ -52,9 +45,9 @@ class Plan:
 
     The rate warms up, stays, and falls to 0 over the last fifth of the steps, so a longer plan can resume
     from any state that came before the fall. average: the half-life of the weights' average, in steps.
-    clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. silent: the
-    share of samples whose noise is 0, as it is where sampling starts from the noise's mean. noise: how
-    strong it is in the others. own: how the error of the photo's own light counts beside that of x0.
+    clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. noiseless: the
+    share of samples whose noise is 0, as when sampling starts from the noise's mean. noise: how
+    strong it is in the others. source_weight: how the error of the source light counts beside that of x0.
     drawn: how much more an error counts where something is drawn: there the light is known, and looked at.
     edges: how the error's differences between neighbouring cells count beside the error: the outline of a
     stroke that shows where the light goes on is small in error and large to the eye.
@@ -73,9 +66,9 @@ class Plan:
     clip: float = 1.0
     shift: float = 8.0
     always_noise: float = 0.85
-    silent: float = 0.7
+    noiseless: float = 0.7
     noise: float = 1.0
-    own: float = 0.25
+    source_weight: float = 0.25
     drawn: float = 0.0
     edges: float = 0.0
     response: float = 0.0
@@ -131,22 +124,23 @@ def flow_loss(
     batch: Batch,
     sigma: Tensor,
     noise: Tensor,
-    own: float = 0.0,
+    source_weight: float = 0.0,
     drawn: float = 0.0,
     edges: float = 0.0,
 ) -> Tensor:
     """Mean squared error of x0 at flow times sigma (B,); the network sees (1 - sigma) x0 + sigma noise.
 
     A batch may carry `weight` (B,), by which each sample's error counts, and `own`, the light on the photo as
-    estimation's x0 has it; the error of the network's idea of it counts `own` times as much as that of x0.
-    Where the mask is, squared errors count `drawn` times more; a sample's weights are 1 in the mean. The
-    differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count `edges` times.
+    estimation's x0 has it; the error of the network's idea of it counts `source_weight` times as much as
+    that of x0. Where the mask is, squared errors count `drawn` times more; a sample's weights are 1 in the
+    mean. The differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count `edges`
+    times.
     """
     s = sigma[:, None, None, None]
     x0 = batch["x0"]
     x = (1 - s) * x0 + s * noise
     inputs = {name: batch[name] for name in ("photo", "light", "mask", "mode")}
-    asked = {"with_own": True} if "own" in batch else {}
+    asked = {"with_source": True} if "own" in batch else {}
     answer = network(x=x, sigma=sigma, **inputs, **asked)
     velocity, light = answer if asked else (answer, None)
     error = x - s * velocity - x0
@@ -158,7 +152,7 @@ def flow_loss(
     if edges:
         errors = errors + edges * (_mean_square(error.diff(dim=2)) + _mean_square(error.diff(dim=3)))
     if light is not None:
-        errors = errors + own * _mean_square(2 * light - 1 - batch["own"])
+        errors = errors + source_weight * _mean_square(2 * light - 1 - batch["own"])
     return (errors * batch["weight"]).mean() if "weight" in batch else errors.mean()
 
 
@@ -173,17 +167,17 @@ def response_loss(network: nn.Module, batch: Batch, factor: Tensor) -> Tensor:
     times = factor[:, None, None, None]
 
     def lit(velocity: Tensor) -> Tensor:
-        return torch.log(srgb_to_linear(photo - velocity.float() / RELIT_SCALE) + FLOOR)
+        return log_floored(srgb_to_linear(photo - velocity.float() / RELIT_SCALE))
 
-    silent = {"x": x, "sigma": sigma, "photo": photo, "mask": mask, "mode": mode}
+    inputs = {"x": x, "sigma": sigma, "photo": photo, "mask": mask, "mode": mode}
     with torch.no_grad():
-        velocity, own = network(**silent, light=light, with_own=True)
+        velocity, source = network(**inputs, light=light, with_source=True)
         before = lit(velocity)
     white = math.log1p(FLOOR)
     expected = before + torch.log((times * light + BOUNCED) / (light + BOUNCED))
-    told = mask * (before < 0)  # of what is all but burnt out, nothing more can be said
-    error = lit(network(**silent, light=times * light, own=own)) - expected.clamp(max=white)
-    return (told * error.square()).sum() / told.sum().clamp_min(1)
+    counted = mask * (before < 0)  # of what is all but burnt out, nothing more can be said
+    error = lit(network(**inputs, light=times * light, own=source)) - expected.clamp(max=white)
+    return (counted * error.square()).sum() / counted.sum().clamp_min(1)
 
 
 def _mean_square(error: Tensor) -> Tensor:
@@ -193,14 +187,14 @@ def _mean_square(error: Tensor) -> Tensor:
 def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
     """(count,) flow times: 1 for a share of the samples, else u -> s u / (1 + (s - 1) u) of a uniform u."""
     u = torch.rand(count, generator=generator)
-    shifted = (plan.shift * u / (1 + (plan.shift - 1) * u)).clamp_min(0.02)
+    shifted = shift_sigma(u, plan.shift).clamp_min(LEAST_SIGMA)
     return torch.where(torch.rand(count, generator=generator) < plan.always_noise, torch.ones(count), shifted)
 
 
-def draw_loud(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
+def draw_noise_strength(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
     """(count, 1, 1, 1): 0 for the share of samples without noise, and the noise's strength."""
-    loud = torch.rand(count, generator=generator) >= plan.silent
-    return plan.noise * loud.float()[:, None, None, None]
+    noisy = torch.rand(count, generator=generator) >= plan.noiseless
+    return plan.noise * noisy.float()[:, None, None, None]
 
 
 def run(
@@ -232,7 +226,7 @@ def run(
     # One process beside the training: several would each draw the same batches.
     loader = DataLoader(batches, batch_size=None, num_workers=1, prefetch_factor=4)
     running = math.nan
-    for batch in islice(_told(loader), max(plan.steps - state.step, 0)):
+    for batch in islice(_with_plain_errors(loader), max(plan.steps - state.step, 0)):
         moved = {name: value.to(accelerator.device) for name, value in batch.items()}
         with accelerator.autocast():
             prepared = prepare(moved)
@@ -246,7 +240,7 @@ def run(
             state.store(out / STATE)  # last: a run that was stopped in between saves its weights once more
 
 
-def _told(batches: Iterable[Batch]) -> Iterator[Batch]:
+def _with_plain_errors(batches: Iterable[Batch]) -> Iterator[Batch]:
     """The batches; what their process could not read is said without that process' traceback."""
     try:
         yield from batches
@@ -262,9 +256,9 @@ def _step(accelerator: Accelerator, network: nn.Module, state: State, batch: Bat
     generator = torch.Generator().manual_seed(seed)  # the host's, so that a seed means the same everywhere
     sigma = draw_sigma(len(batch["x0"]), plan, generator).to(accelerator.device)
     noise = torch.randn(batch["x0"].shape, generator=generator).to(accelerator.device)
-    noise *= draw_loud(len(noise), plan, generator).to(accelerator.device)
+    noise *= draw_noise_strength(len(noise), plan, generator).to(accelerator.device)
     with accelerator.autocast():
-        loss = flow_loss(network, batch, sigma, noise, plan.own, plan.drawn, plan.edges)
+        loss = flow_loss(network, batch, sigma, noise, plan.source_weight, plan.drawn, plan.edges)
         if plan.response:
             some = {name: value[: -(-len(sigma) // 4)] for name, value in batch.items()}
             stops = 2 * STOPS * torch.rand(len(some["x0"]), generator=generator) - STOPS

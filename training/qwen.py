@@ -7,7 +7,6 @@ embedded once, without pictures, so the LoRA belongs in a bundle with a prompt c
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,16 +23,22 @@ from transformers import Qwen2_5_VLForConditionalGeneration, Qwen2Tokenizer
 from dior_rt.errors import InputError
 from dior_rt.families.mini import MODES
 from dior_rt.families.qwen.frame import fit_area
-from dior_rt.families.qwen.settings import LUMI_PEAK, LUMI_SCALE
 from dior_rt.families.qwen.template import SKIP, TEMPLATE, Prompts
 from dior_rt.files import reason
 from dior_rt.training.backbone import resample
 from dior_rt.training.fit import Plan, Progress, rendered, run
-from dior_rt.training.network import RELIT_SCALE, decode_light
+from dior_rt.training.light import (
+    RELIT_SCALE,
+    decode_lumi,
+    draw_lumi,
+    pack_patches,
+    undraw_lumi,
+    unpack_patches,
+)
 
 MULTIPLE: Final = 32
 LOCAL: Final[dict[str, Any]] = {"local_files_only": True, "use_safetensors": True}
-SAID: Final = {MODES["relight"]: Prompts.relight, MODES["estimate"]: Prompts.estimate}
+DEFAULT_PROMPTS: Final = {MODES["relight"]: Prompts.relight, MODES["estimate"]: Prompts.estimate}
 ADAPTER: Final = "light"
 TARGETS: Final = [
     *(f"to_{role}" for role in ("q", "k", "v", "out.0", "add_out")),
@@ -76,7 +81,7 @@ class Qwen(nn.Module):
         """One sample: the modes differ in the length of their prompts and the number of references."""
         pictures = [x, photo, light] if mode == MODES["relight"] else [x, photo]
         rows, columns = x.shape[1:]
-        tokens = torch.cat([pack(picture) for picture in pictures])
+        tokens = torch.cat([pack_patches(picture) for picture in pictures])
         velocity = self.transformer(
             hidden_states=tokens[None],
             encoder_hidden_states=self.prompts[str(mode)][None],
@@ -84,7 +89,7 @@ class Qwen(nn.Module):
             img_shapes=[[(1, rows // 2, columns // 2)] * len(pictures)],
             return_dict=False,
         )[0][0, : rows * columns // 4]
-        return unpack(velocity, rows // 2, columns // 2)
+        return unpack_patches(velocity, (rows // 2, columns // 2))
 
     def load(self, path: Path) -> None:
         """Take up a LoRA that `save` wrote. Raises InputError for any other."""
@@ -121,9 +126,9 @@ class Pictures:
         """photo, light, mask, mode and x0 of mini -> the same names, in latents."""
         photo, mode = batch["photo"], batch["mode"][:, None, None, None]
         relit = photo + batch["x0"] / RELIT_SCALE
-        lumi = draw(decode_light((batch["x0"] + 1) / 2))
+        lumi = draw_lumi(decode_lumi((batch["x0"] + 1) / 2))
         painted = torch.where(mode == MODES["relight"], relit, lumi)
-        light = draw(batch["light"]) * (batch["mask"] > 0)
+        light = draw_lumi(batch["light"]) * (batch["mask"] > 0)
         latents = {"x0": painted, "photo": photo, "light": light}
         # Of the photo's own light this network has no idea that could be compared.
         kept = {name: value for name, value in batch.items() if name != "own"}
@@ -131,7 +136,7 @@ class Pictures:
 
     def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
         """Latents of drawn light -> the light on a grid, (B, 3, h, w), linear."""
-        return resample(undraw(self.decode(x0)), grid)
+        return resample(undraw_lumi(self.decode(x0)), grid)
 
     @torch.no_grad()
     def encode(self, pictures: Tensor) -> Tensor:
@@ -220,7 +225,7 @@ def dtype_of(plan: Plan) -> torch.dtype:
 
 
 @torch.no_grad()
-def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor]:
+def embed_prompts(folder: Path, prompts: dict[int, str] = DEFAULT_PROMPTS) -> dict[int, Tensor]:
     """The embeddings (T, D) of each mode's prompt in the model's template, less its first words.
 
     Raises InputError where the folder has no text encoder.
@@ -233,31 +238,8 @@ def embed_prompts(folder: Path, said: dict[int, str] = SAID) -> dict[int, Tensor
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"Cannot read the text encoder in {folder}: {reason(error)}.") from error
     embeddings = {}
-    for mode, words in said.items():
+    for mode, words in prompts.items():
         tokens = tokenizer(TEMPLATE.format(words), return_tensors="pt")
         hidden = encoder(**tokens, output_hidden_states=True).hidden_states[-1]
         embeddings[mode] = hidden[0, SKIP:].float()
     return embeddings
-
-
-def draw(light: Tensor) -> Tensor:
-    """Light as a picture 0..1, as the runtime draws it: log(1 + 8 L) / log(1 + 8 peak)."""
-    return (torch.log1p(LUMI_SCALE * light) / math.log1p(LUMI_SCALE * LUMI_PEAK)).clamp(0, 1)
-
-
-def undraw(picture: Tensor) -> Tensor:
-    """The inverse of `draw`, as the runtime has it."""
-    return torch.expm1(picture * math.log1p(LUMI_SCALE * LUMI_PEAK)) / LUMI_SCALE
-
-
-def pack(latents: Tensor) -> Tensor:
-    """(z, h, w) -> tokens of 2 x 2, (h w / 4, 4 z), row by row."""
-    channels, rows, columns = latents.shape
-    split = latents.reshape(channels, rows // 2, 2, columns // 2, 2)
-    return split.permute(1, 3, 0, 2, 4).reshape(-1, 4 * channels)
-
-
-def unpack(tokens: Tensor, rows: int, columns: int) -> Tensor:
-    """The inverse of `pack`, for tokens of rows x columns."""
-    split = tokens.reshape(rows, columns, -1, 2, 2).permute(2, 0, 3, 1, 4)
-    return split.reshape(-1, 2 * rows, 2 * columns)

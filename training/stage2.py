@@ -33,7 +33,7 @@ from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
 from dior_rt.training.backbone import Backbone
 from dior_rt.training.fit import Batch, Plan, Progress, rendered, run
-from dior_rt.training.network import RELIT_SCALE, linear_to_srgb
+from dior_rt.training.light import RELIT_SCALE, linear_to_srgb
 
 OPS: Final = NumpyOps()
 SPARSITIES: Final = get_args(Sparsity)
@@ -182,12 +182,12 @@ def fit_stage2(
         return MixedBatches(scenes, triplets(start, rank), seed, start, mixture.rendered_weight)
 
     def prepare(batch: Batch) -> Batch:
-        return backbone.prepare(with_own_strokes(backbone, batch, mixture.estimate_steps, plan.shift))
+        return backbone.prepare(with_estimated_strokes(backbone, batch, mixture.estimate_steps, plan.shift))
 
     run(backbone.network, stream, out, plan, progress, backbone.save, prepare)
 
 
-def with_own_strokes(backbone: Backbone, batch: Batch, steps: int, shift: float) -> Batch:
+def with_estimated_strokes(backbone: Backbone, batch: Batch, steps: int, shift: float) -> Batch:
     """The batch with strokes for its real pairs, sparsified from what the model sees in their targets."""
     real, seed = batch["real"], int(batch["seed"])
     target = batch["photo"][real] + batch["x0"][real] / RELIT_SCALE
@@ -203,11 +203,11 @@ def estimate(backbone: Backbone, photos: Tensor, seed: int, sigmas: list[float])
     count, nothing = len(photos), torch.zeros_like(photos)
     mode = torch.full((count,), MODES["estimate"], device=photos.device)
     asked = {"photo": photos, "light": nothing, "mask": nothing[:, :1], "mode": mode, "x0": nothing}
-    given = backbone.prepare(asked)
-    x0 = given.pop("x0")
+    inputs = backbone.prepare(asked)
+    x0 = inputs.pop("x0")
     x = torch.randn(x0.shape, generator=torch.Generator().manual_seed(seed)).to(x0.device)
     for sigma, following in pairwise(sigmas):
-        x = x + (following - sigma) * backbone.network(x=x, sigma=x.new_full((count,), sigma), **given)
+        x = x + (following - sigma) * backbone.network(x=x, sigma=x.new_full((count,), sigma), **inputs)
     return backbone.lumi(x, (photos.shape[2], photos.shape[3]))
 
 

@@ -1,15 +1,13 @@
-"""Photos and light drawn on them, by the dozen: from held-out renders, or made by arithmetic."""
+"""Cases to measure presets with: synthetic photos, and strokes on them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from dior_rt.errors import InputError
 from dior_rt.kernels import NumpyOps, Stroke, Strokes
 
 SIZES = ((160, 240), (200, 200), (240, 160))
@@ -18,7 +16,7 @@ OPS = NumpyOps()
 
 @dataclass(frozen=True)
 class Case:
-    """photo: (H, W, 3) uint8, sRGB. strokes: of its size. seed: of the noise."""
+    """A photo (H, W, 3), uint8, sRGB, with strokes of the same size and a seed for the noise."""
 
     photo: NDArray[np.uint8]
     strokes: Strokes
@@ -26,28 +24,8 @@ class Case:
 
 
 def made_up(count: int) -> list[Case]:
-    """Balls before a textured wall under one light, and strokes of any colour and strength."""
+    """Return synthetic cases: balls before a textured wall, and strokes of random colour and strength."""
     return [_made_up(np.random.default_rng([number, 71]), number) for number in range(count)]
-
-
-def from_renders(folder: Path, count: int) -> list[Case]:
-    """Pairs mixed from a folder of renders; half replace all lights, half change one, and of each half the
-    light is given whole or as strokes. Needs dior-rt[train]. Raises InputError for too few renders."""
-    from dior_rt.training.data.triplets import interest, load_views, pair
-
-    views = load_views(folder)
-    if len(views) < count:
-        raise InputError(f"{folder} has {len(views)} views, fewer than {count}.")
-    cases = []
-    for number, view in enumerate(views[:count]):
-        sample = pair(np.random.default_rng([number, 72]), view, ("replace", "change")[number % 2])
-        if number // 2 % 2:
-            drawn = Strokes(sample.target, np.ones(sample.target.shape[:2], np.float32))
-        else:
-            where = interest(sample) if sample.kind == "change" else None
-            drawn = OPS.sparsify(sample.target, "strokes", number, interest=where)
-        cases.append(Case(OPS.encode_srgb(sample.photo, np.uint8), drawn, number))
-    return cases
 
 
 def _made_up(rng: Generator, seed: int) -> Case:

@@ -1,4 +1,4 @@
-"""How far a picture is from the reference's: to the eye, and in its light."""
+"""Measure how far a picture is from the reference's, in appearance and in light."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from numpy.typing import NDArray
 from dior_rt.grid import GridRule
 from dior_rt.kernels import NumpyOps
 
-ROWS = 256  # compared at a time, so that a large picture needs no second one in float64
+ROWS = 256  # rows compared at a time, so that a large picture needs no float64 copy
 
 
-Distance = Callable[[NDArray[np.uint8], NDArray[np.uint8]], float]  # of two pictures, to the eye
+Distance = Callable[[NDArray[np.uint8], NDArray[np.uint8]], float]  # perceptual distance of two pictures
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Of a picture from the reference.
+    """The difference of a picture from the reference.
 
-    psnr: dB over the sRGB-encoded samples, peak 1; None where the pictures are identical. largest: of any
-    sample, in 1/255. light: sum |L - L_ref| / sum L_ref over the linear light L of the cells of a grid.
-    lpips: the perceptual distance, where it was asked for.
+    psnr: dB over the sRGB-encoded samples, peak 1; None if the pictures are identical.
+    largest: the largest difference of any sample, in 1/255.
+    light: sum |L - L_ref| / sum L_ref over the linear light L of the cells of a grid.
+    lpips: the perceptual distance, if requested.
     """
 
     psnr: float | None
@@ -34,7 +35,7 @@ class Difference:
 
 
 def compare_pictures(picture: NDArray, reference: NDArray, lpips: Distance | None = None) -> Difference:
-    """Compare two pictures (H, W, 3) of one integer dtype, sRGB-encoded. Raises ValueError for other ones."""
+    """Compare two sRGB-encoded pictures (H, W, 3) of the same integer dtype. Raises ValueError otherwise."""
     if picture.shape != reference.shape or picture.dtype != reference.dtype:
         raise ValueError(
             f"{picture.shape} of {picture.dtype} is not comparable to {reference.shape} of {reference.dtype}"
@@ -52,7 +53,7 @@ def compare_pictures(picture: NDArray, reference: NDArray, lpips: Distance | Non
 
 
 def worst(differences: Sequence[Difference]) -> Difference:
-    """The worst of each figure."""
+    """Return the worst of each figure."""
     return Difference(
         min((d.psnr for d in differences if d.psnr is not None), default=None),
         max(d.largest for d in differences),
@@ -68,5 +69,5 @@ def _eight_bits(picture: NDArray) -> NDArray[np.uint8]:
 def _light_error(picture: NDArray, reference: NDArray) -> float:
     ops, grid = NumpyOps(), GridRule().shape(*reference.shape[:2])
     light, wanted = ops.reduce_photo(picture, grid), ops.reduce_photo(reference, grid)
-    # A black reference has no light that an error could be relative to; the smallest float keeps it finite.
+    # The reference may be black. The smallest float keeps the quotient finite.
     return float(np.abs(light - wanted).mean() / max(wanted.mean(), np.finfo(np.float32).tiny))

@@ -1,6 +1,6 @@
-"""A step of the network: how many floating-point operations it is, and how fast its products run alone.
+"""Count the floating-point operations of a step, and measure how fast its matrix products run.
 
-Both come from a real run: ONNX Runtime tells the shapes and the time of every node.
+Both come from a real run: ONNX Runtime reports the shapes and the time of every node.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PRODUCTS = ("MatMul", "MatMulInteger", "MatMulNBits", "Gemm")
 CONVOLUTIONS = ("Conv", "ConvInteger")
 TRANSPOSED = ("ConvTranspose",)
 ATTENTIONS = ("Attention", "MultiHeadAttention")
-#: What ONNX Runtime's own optimisation makes of the first three.
+#: The node types into which ONNX Runtime's optimiser turns the first three.
 FUSED = ("FusedMatMul", "FusedGemm", "FusedConv", "DynamicQuantizeMatMul", "MatMulIntegerToFloat")
 TRIES = 9
 
@@ -34,8 +34,10 @@ Shape = Sequence[int]
 
 @dataclass(frozen=True)
 class Step:
-    """What a step's cost depends on: the network, as its bundle's folder, the cells of the grid in units of
-    the grid's multiple, and the branches of guidance."""
+    """Everything that the cost of a step depends on.
+
+    bundle: the folder. rows, columns: of the grid, in units of its multiple. branches: of guidance, 1 or 2.
+    """
 
     bundle: str
     rows: int
@@ -44,16 +46,17 @@ class Step:
 
     @property
     def name(self) -> str:
-        """For people and for JSON."""
+        """Return the name for tables and JSON keys."""
         return f"{self.bundle}, {self.rows} x {self.columns} x {self.branches}"
 
 
 def node_flops(operation: str, inputs: Sequence[Shape], output: Shape) -> int:
-    """2 x (elements of the output) x (length of the sums): a multiplication and an addition each.
+    """Return 2 x (elements of the output) x (length of the sums): one multiplication and one addition each.
 
     Matrix products sum over the last side of their first input. A convolution sums over all sides of its
-    weights but the first; a transposed one makes of every element all sides of its weights but the first.
-    Attention is two products. Everything else is not counted: it is bound by memory, and small beside these.
+    weights except the first. A transposed convolution multiplies every input element by all sides of its
+    weights except the first. Attention is two products. Nothing else is counted: other nodes are bound by
+    memory and small in comparison.
     """
     if operation in PRODUCTS:
         return 2 * math.prod(output) * inputs[0][-1]
@@ -67,8 +70,7 @@ def node_flops(operation: str, inputs: Sequence[Shape], output: Shape) -> int:
 
 
 def graph_flops(model: Path, feeds: Mapping[str, NDArray]) -> dict[str, int]:
-    """The operations of one run of an ONNX graph by kind of node, its nodes as they stand in the file, not
-    fused."""
+    """Return the operations of one run of an ONNX graph by type of node, without fusing nodes."""
     found: dict[str, int] = defaultdict(int)
     for node in _profile(model, feeds, ort.GraphOptimizationLevel.ORT_DISABLE_ALL, 1):
         what = node["args"]
@@ -78,11 +80,11 @@ def graph_flops(model: Path, feeds: Mapping[str, NDArray]) -> dict[str, int]:
 
 
 def product_rate(bundle: Bundle, step: Step) -> float:
-    """Floating-point operations a second of the network's matrix products and convolutions by themselves.
+    """Return the floating-point operations per second of the network's matrix products and convolutions.
 
-    They are timed where they are, in runs of the whole graph on as many threads as ONNX Runtime takes: at
-    their own shapes, with all weights passing through the caches between one use and the next. The seconds
-    are the medians of a few runs, node by node. Attention is left out, for there is more in it than products.
+    They are timed inside runs of the whole graph, on as many threads as ONNX Runtime uses. So they have their
+    real shapes, and all weights pass through the caches between two uses. The seconds are medians of a few
+    runs per node. Attention is left out, because its node does more than products.
     """
     model, feeds = bundle.path("velocity"), step_feeds(bundle, step)
     flops = sum(count for kind, count in graph_flops(model, feeds).items() if kind not in ATTENTIONS)
@@ -94,9 +96,9 @@ def product_rate(bundle: Bundle, step: Step) -> float:
 
 
 def step_of(bundle: Bundle, size: tuple[int, int], guidance: float) -> Step | None:
-    """The step for a photo of `size` pixels; guidance other than 0 and 1 takes two branches.
+    """Return the step for a photo of `size` pixels. Guidance other than 0 and 1 takes two branches.
 
-    None for families without a light grid, whose graphs are too large to be run for this alone.
+    Return None for families without a light grid. Their graphs are too large to run only for this.
     """
     grid = bundle.manifest.grid
     if grid is None:
@@ -106,12 +108,12 @@ def step_of(bundle: Bundle, size: tuple[int, int], guidance: float) -> Step | No
 
 
 def step_flops(bundle: Bundle, step: Step) -> int:
-    """The operations of one step."""
+    """Return the number of operations of one step."""
     return sum(graph_flops(bundle.path("velocity"), step_feeds(bundle, step)).values())
 
 
 def step_feeds(bundle: Bundle, step: Step) -> dict[str, NDArray]:
-    """Inputs of a step of that size; values change neither the count nor the time."""
+    """Return inputs of a step of that size. Their values change neither the count nor the time."""
     sides = {"batch": step.branches, "rows": step.rows, "columns": step.columns}
     return {
         tensor.name: np.ones([_side(side, sides) for side in tensor.shape], tensor.dtype)
@@ -122,7 +124,7 @@ def step_feeds(bundle: Bundle, step: Step) -> dict[str, NDArray]:
 def _profile(
     model: Path, feeds: Mapping[str, NDArray], level: ort.GraphOptimizationLevel, runs: int
 ) -> list[dict[str, Any]]:
-    """What ONNX Runtime says of every node of every run."""
+    """Yield ONNX Runtime's profile of every node in every run."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
     options.graph_optimization_level = level
@@ -136,14 +138,14 @@ def _profile(
     return [event for event in events if event["name"].endswith("_kernel_time")]
 
 
-def _side(side: int | str, known: Mapping[str, int]) -> int:
-    """The length of a side such as 3, "rows" or "4*rows"."""
+def _side(side: int | str, sides: Mapping[str, int]) -> int:
+    """Return the length of a side such as 3, "rows" or "4*rows"."""
     if isinstance(side, int):
         return side
     factor, _, name = side.rpartition("*")
-    return int(factor or 1) * known[name]
+    return int(factor or 1) * sides[name]
 
 
 def _shapes(described: Sequence[Mapping[str, Any]]) -> list[Shape]:
-    """Of [{"float": [2, 3]}, {"int64": []}]."""
+    """Return the shapes in a profile entry such as [{"float": [2, 3]}, {"int64": []}]."""
     return [shape for tensor in described for shape in tensor.values()]

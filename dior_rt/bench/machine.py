@@ -1,4 +1,4 @@
-"""The machine: what it is, and what it does at best (its rooflines)."""
+"""Describe the machine, and measure what it can do at best (its rooflines)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PACKAGES = ("dior-rt", "numpy", "onnxruntime", "pyopencl", "pillow")
 
 @dataclass(frozen=True)
 class Machine:
-    """cores: of the processor, and those this process may use. memory_bytes: None where it is not known."""
+    """The hardware and versions. memory_bytes: None if unknown."""
 
     system: str
     cpu: str
@@ -38,9 +38,13 @@ class Machine:
 
 @dataclass(frozen=True)
 class Rooflines:
-    """gemm: floating-point operations a second of NumPy's float32 product of two 1024 x 1024 matrices, on as
-    many threads as its BLAS takes. copy: bytes read and written a second in copying 256 MiB, by what copies
-    ("numpy" in main memory, "opencl:0" in that device's). products: as `product_rate`, by the step's name."""
+    """The best rates of the machine.
+
+    gemm: floating-point operations per second of NumPy's float32 product of two 1024 x 1024 matrices, on as
+    many threads as its BLAS uses. copy: bytes read and written per second while copying 256 MiB, by kernels
+    ("numpy" in main memory, "opencl:0" in that device's memory). products: `product_rate` by the name of
+    the step.
+    """
 
     gemm: float
     copy: dict[str, float]
@@ -48,26 +52,29 @@ class Rooflines:
 
 
 def this_machine() -> Machine:
-    """The machine that this runs on."""
+    """Return the machine that this process runs on."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
             versions[package] = version(package)
-        except PackageNotFoundError:  # ONNX Runtime comes under several names
+        except PackageNotFoundError:  # ONNX Runtime has several package names
             continue
     return Machine(platform.platform(), _cpu(), os.cpu_count() or 1, usable_cores(), _memory(), versions)
 
 
 def measure_rooflines(ops: Sequence[str], steps: Mapping[Step, Bundle]) -> Rooflines:
-    """One measurement, each figure the best or the median of a few tries. ops: the kernels whose memory is
-    measured; steps: those whose products are, and their bundles."""
+    """Measure once; each figure is the best or the median of a few tries.
+
+    ops: the kernels whose memory is measured. steps: the steps whose products are measured, and their
+    bundles.
+    """
     copies = {name: _opencl_copy(name) for name in ops if name != "numpy"}
     products = {step.name: product_rate(bundle, step) for step, bundle in steps.items()}
     return Rooflines(_gemm(), {"numpy": _numpy_copy(), **copies}, products)
 
 
 def medians(measured: Sequence[Rooflines]) -> Rooflines:
-    """The median of each figure."""
+    """Return the median of each figure."""
     first = measured[0]
     return Rooflines(
         median(one.gemm for one in measured),
@@ -96,14 +103,14 @@ def _opencl_copy(name: str) -> float:
     context = cl.Context([device.handle])
     queue, flags = cl.CommandQueue(context), cl.mem_flags.READ_WRITE
     source, target = cl.Buffer(context, flags, COPY_BYTES), cl.Buffer(context, flags, COPY_BYTES)
-    for buffer in (source, target):  # memory that was never written may not be there yet
+    for buffer in (source, target):  # the system may not have mapped memory that was never written
         cl.enqueue_fill_buffer(queue, buffer, np.array(1, np.uint8), 0, COPY_BYTES).wait()
     return 2 * COPY_BYTES / _best(lambda: cl.enqueue_copy(queue, target, source).wait())
 
 
 def _best(action: Callable[[], object]) -> float:
     seconds = []
-    for _ in range(TRIES + 1):  # the first one wakes threads and touches memory
+    for _ in range(TRIES + 1):  # the first one starts threads and maps memory
         start = perf_counter()
         action()
         seconds.append(perf_counter() - start)

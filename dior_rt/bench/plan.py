@@ -1,4 +1,4 @@
-"""What is run: settings, each of which changes one thing of the reference."""
+"""The settings of a benchmark. Each changes one thing of the reference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dior_rt.presets import REFERENCE, read_presets
 STEPS = (1, 2, 4, 8, 16, 20)
 QUICK_STEPS = (1, 4, 16)
 
-#: Cheap ways to walk the flow, with so many steps where solvers are compared.
+#: The number of steps for the comparison of solvers.
 SOLVER_STEPS = 8
 INTERVALS = ((0.3, 1.0), (0.5, 1.0), (0.8, 1.0), (0.0, 0.8))
 TOLERANCES = (0.5 / 255, 2 / 255)
@@ -22,8 +22,12 @@ TOLERANCES = (0.5 / 255, 2 / 255)
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to relight. bundle: its folder. device, ops, threads: as for `Relighter`; None is all cores.
-    preset ... tolerance: as for `Relighter.relight`; what is None, or the empty interval, the preset says."""
+    """One way to relight.
+
+    bundle: its folder. device, ops, threads: as for `Relighter`; None means all cores.
+    preset, steps, solver, guidance, interval, tolerance: as for `Relighter.relight`. The preset decides
+    where the value is None or the interval is empty.
+    """
 
     bundle: str
     preset: str
@@ -37,7 +41,7 @@ class Setting:
     threads: int | None
 
     def name(self, reference: Setting) -> str:
-        """What differs from the reference, such as "steps 8"; by it reports are compared."""
+        """Return what differs from the reference, such as "steps 8". Reports are compared by this name."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         changed = [
             f"{name} {_short(value)}"
@@ -47,19 +51,19 @@ class Setting:
         return ", ".join(changed) or "reference"
 
     def takes_whole_cpu(self) -> bool:
-        """Whether all cores work on the network, as they do on what its rate is compared with."""
+        """Return whether all cores run the network, as they do in the roofline measurement."""
         return self.device == "cpu" and self.threads is None
 
     def how(self) -> dict[str, Any]:
-        """The arguments of `Relighter.relight`."""
+        """Return the arguments of `Relighter.relight`."""
         names = ("preset", "steps", "solver", "guidance", "tolerance")
         return {name: getattr(self, name) for name in names} | {"interval": self.interval or None}
 
 
 def reference_of(bundles: Sequence[Bundle], ops: str) -> Setting:
-    """The reference: the first bundle in fp32, else the first; its own steps and guidance, on the CPU."""
+    """Return the reference: the first bundle in fp32, or else the first, with its own settings on the CPU."""
     bundle = next((bundle for bundle in bundles if bundle.manifest.precision == "fp32"), bundles[0])
-    return _own(bundle, ops)
+    return _default_setting(bundle, ops)
 
 
 def sweep(
@@ -70,38 +74,42 @@ def sweep(
     threads: Sequence[int] = (),
     ways: bool = False,
 ) -> list[Setting]:
-    """The settings to compare, the reference first, none twice. A new kind of setting is one more line here.
+    """Return the settings to compare, without duplicates, the reference first.
 
-    ops: the reference's first. ways: also solvers, intervals of guidance, tolerances.
+    ops: the first one is the reference's. ways: include solvers, guidance intervals and tolerances.
+    A new kind of setting is one more line here.
     """
     reference = reference_of(bundles, ops[0])
-    own = next(bundle for bundle in bundles if str(bundle.folder) == reference.bundle)
+    bundle_of_reference = next(bundle for bundle in bundles if str(bundle.folder) == reference.bundle)
     return list(
         dict.fromkeys(
             [
                 reference,
                 *(replace(reference, steps=count) for count in steps),
                 replace(reference, guidance=1.0),  # one branch of the network instead of two
-                *(_ways(reference, own) if ways else ()),
-                *(replace(reference, preset=name, steps=None, solver=None) for name in read_presets(own)),
+                *(_ways(reference, bundle_of_reference) if ways else ()),
+                *(
+                    replace(reference, preset=name, steps=None, solver=None)
+                    for name in read_presets(bundle_of_reference)
+                ),
                 *(replace(reference, threads=count) for count in threads),
                 *(replace(reference, ops=name) for name in ops),
                 *(replace(reference, device=name) for name in devices),
-                *(_own(bundle, ops[0]) for bundle in bundles),
+                *(_default_setting(bundle, ops[0]) for bundle in bundles),
             ]
         )
     )
 
 
 def usable_cores() -> int:
-    """The processor cores that this process may use."""
+    """Return how many processor cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def thread_counts(cores: int) -> list[int]:
-    """The powers of two below the number of cores; all of them is what the reference takes.
+    """Return the powers of two below the number of cores. The reference uses all cores.
 
     >>> thread_counts(1), thread_counts(2), thread_counts(12)
     ([], [1], [1, 2, 4, 8])
@@ -110,12 +118,12 @@ def thread_counts(cores: int) -> list[int]:
 
 
 def interleave(settings: Sequence[Setting], repeats: int) -> list[Setting]:
-    """A B C A B C ...: a machine that slows down during the run slows down all settings alike."""
+    """Return A B C A B C ..., so that a machine that slows down affects all settings alike."""
     return [setting for _ in range(repeats) for setting in settings]
 
 
 def _ways(reference: Setting, bundle: Bundle) -> list[Setting]:
-    """Solvers at the same small number of steps, guidance in intervals, and, on a light grid, tolerances."""
+    """Return settings for solvers, guidance intervals and, on a light grid, tolerances."""
     few = min(SOLVER_STEPS, bundle.manifest.steps)
     return [
         *(replace(reference, steps=few, solver=name) for name in SOLVERS),
@@ -128,7 +136,7 @@ def _ways(reference: Setting, bundle: Bundle) -> list[Setting]:
     ]
 
 
-def _own(bundle: Bundle, ops: str) -> Setting:
+def _default_setting(bundle: Bundle, ops: str) -> Setting:
     manifest = bundle.manifest
     return Setting(
         bundle=str(bundle.folder),
@@ -145,7 +153,7 @@ def _own(bundle: Bundle, ops: str) -> Setting:
 
 
 def _short(value: object) -> str:
-    """A number as it reads best; an interval by its ends."""
+    """Format a number with three digits, an interval by its ends."""
     if isinstance(value, tuple):
         return " to ".join(map(_short, value))
     return f"{value:.3g}" if isinstance(value, float) else str(value)

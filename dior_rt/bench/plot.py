@@ -1,4 +1,4 @@
-"""The plot of speed against error. Needs matplotlib, the extra `bench`."""
+"""Plot speed against error. Needs matplotlib, from the extra `bench`."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from dior_rt.bench.report import Report, pareto_front
 from dior_rt.files import replacing
 
-ROOM = 6.0  # dB, from the highest figure to the line of those that are identical
+ROOM = 6.0  # dB between the highest figure and the line of identical results
 
 
 def plot(path: Path, report: Report) -> None:
-    """Draw every setting at (seconds a photo, PSNR to the reference), and a line through the Pareto front.
+    """Draw every setting at (seconds per photo, PSNR to the reference), and the Pareto front.
 
-    Writes a PNG, whole or not at all. Raises InputError where it cannot be written.
+    Writes a complete PNG or none. Raises InputError if it cannot be written.
     """
     decibels = [result.difference.psnr for result in report.results]
     identical = max((value for value in decibels if value is not None), default=0.0) + ROOM
@@ -32,13 +32,13 @@ def plot(path: Path, report: Report) -> None:
         identical, color="tab:gray", linewidth=0.8, linestyle="--", label="identical to the reference"
     )
     axes.step(
-        *zip(*front, strict=True), where="post", color="tab:orange", label="nothing is faster and closer"
+        *zip(*front, strict=True), where="post", color="tab:orange", label="no setting is faster and closer"
     )
     axes.plot(*zip(*points, strict=True), "o", color="tab:gray")
     axes.plot(*zip(*front, strict=True), "o", color="tab:orange")
     middle = (min(points)[0] * max(points)[0]) ** 0.5
     for result, point in zip(report.results, points, strict=True):
-        right = point[0] > middle  # names grow towards the middle, and stay inside
+        right = point[0] > middle  # labels extend towards the middle and stay inside
         axes.annotate(
             result.name,
             point,
@@ -52,7 +52,7 @@ def plot(path: Path, report: Report) -> None:
     axes.xaxis.set_minor_formatter(
         StrMethodFormatter("{x:g}") if max(points)[0] < 100 * min(points)[0] else NullFormatter()
     )
-    axes.set_xlabel("seconds a photo")
+    axes.set_xlabel("seconds per photo")
     axes.set_ylabel("PSNR to the reference, dB")
     machine = report.machine
     axes.set_title(

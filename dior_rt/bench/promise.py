@@ -1,4 +1,4 @@
-"""What a preset promises: PSNR to the reference's picture, of the worst of many cases; and what keeps it."""
+"""Check what presets promise (the PSNR to the reference in the worst of many cases), and find presets."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from dior_rt.flow.solvers import SOLVERS
 from dior_rt.presets import ALWAYS, PRESETS, PROMISES, Preset
 from dior_rt.relight import Relighter, Relit
 
-IDENTICAL: Final = 100.0  # dB that stand for a picture without any difference
-MARGIN: Final = 1.0  # dB that a preset keeps in hand for cases it has not seen
+IDENTICAL: Final = 100.0  # dB for a picture without any difference
+MARGIN: Final = 1.0  # dB of reserve for cases that were not measured
 
 STEPS: Final = (1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 20, 24, 28, 32, 36, 40)
 SHIFTS: Final = (2.0, 3.0, 5.0, 8.0)
@@ -34,8 +34,11 @@ INTERVALS: Final = (ALWAYS, (0.3, 1.0), (0.5, 1.0), (0.7, 1.0), (0.9, 1.0), (0.0
 
 @dataclass(frozen=True)
 class Kept:
-    """worst, median: dB to the reference over the cases. speed: the median of the ratios of the reference's
-    seconds to these, in the sampler alone and in all. steps: the least and most taken."""
+    """How well a preset keeps its promise.
+
+    worst, median: dB to the reference over the cases. speed: the median ratio of the reference's seconds to
+    the preset's, in the sampler alone and in total. steps: the fewest and the most that were taken.
+    """
 
     worst: float
     median: float
@@ -45,7 +48,7 @@ class Kept:
 
 
 def settings(preset: Preset) -> dict[str, Any]:
-    """A preset as arguments of `Relighter.relight`, whatever the bundle's own presets are."""
+    """Return a preset as arguments of `Relighter.relight`, independent of the bundle's presets."""
     return asdict(preset)
 
 
@@ -54,7 +57,7 @@ def relight(relighter: Relighter, case: Case, **how: Any) -> Relit:
 
 
 def decibels(relit: Relit, reference: NDArray) -> float:
-    """PSNR of a relit picture to the reference's."""
+    """Return the PSNR of a relit picture to the reference's."""
     psnr = compare_pictures(np.asarray(relit.picture), reference).psnr
     return IDENTICAL if psnr is None else psnr
 
@@ -65,18 +68,18 @@ def keep(
     ways: Mapping[str, Mapping[str, Any]],
     advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Kept]:
-    """Relight every case by the reference and by every way, in turns."""
+    """Relight every case with the reference and with every setting, in turns."""
     found: dict[str, list[tuple[float, float, float, int]]] = {name: [] for name in ways}
-    relight(relighter, cases[0], steps=2)  # to wake threads and caches
+    relight(relighter, cases[0], steps=2)  # warm up threads and caches
     for case in cases:
         reference, seconds = _timed(relighter, case, {})
         for name, how in ways.items():
-            relit, own = _timed(relighter, case, how)
+            relit, spent = _timed(relighter, case, how)
             found[name].append(
                 (
                     decibels(relit, np.asarray(reference.picture)),
                     reference.seconds["steps"] / relit.seconds["steps"],
-                    seconds / own,
+                    seconds / spent,
                     relit.steps,
                 )
             )
@@ -85,12 +88,12 @@ def keep(
 
 
 def cost(preset: Preset, bundle: Bundle) -> int:
-    """How often a picture runs a branch of the network."""
+    """Return how many network branches a picture runs."""
     manifest = bundle.manifest
     schedule = ShiftSchedule(preset.shift) if preset.shift else manifest.schedule
     assert isinstance(schedule, ShiftSchedule)
     sigmas, asks = schedule.sigmas(preset.steps).tolist(), SOLVERS[preset.solver].asks
-    asked = [sigma for sigma in sigmas[:1] + sigmas[1:-1] * asks]
+    asked = sigmas[:1] + sigmas[1:-1] * asks
     low, high = preset.interval
     if manifest.guidance in (0, 1):
         return len(asked)
@@ -98,7 +101,7 @@ def cost(preset: Preset, bundle: Bundle) -> int:
 
 
 def candidates(bundle: Bundle) -> list[Preset]:
-    """Everything to be tried, cheapest first."""
+    """Return all candidates, cheapest first."""
     manifest = bundle.manifest
     assert isinstance(manifest.schedule, ShiftSchedule)
     shifts = (None, *(shift for shift in SHIFTS if shift != manifest.schedule.shift))
@@ -109,18 +112,18 @@ def candidates(bundle: Bundle) -> list[Preset]:
 
 
 def find(relighter: Relighter, cases: Sequence[Case], say: Callable[[str], None]) -> dict[str, Preset]:
-    """The cheapest candidate that keeps each promise in every case, with a margin; else the reference."""
-    found, own = {}, Preset(relighter.bundle.manifest.steps)
+    """Return the cheapest candidate that keeps each promise with a margin in every case, or the reference."""
+    found, full = {}, Preset(relighter.bundle.manifest.steps)
     left = iter(candidates(relighter.bundle))
     references: dict[int, NDArray] = {}
-    hardest = list(range(len(cases)))  # those that refused a candidate come first
-    kept, cheapest = 0.0, own
+    hardest = list(range(len(cases)))  # cases that failed a candidate come first
+    kept, cheapest = 0.0, full
     for name, promise in sorted(PROMISES.items(), key=lambda item: item[1]):
-        if kept >= promise + MARGIN:  # a weaker promise's preset keeps this one, too
+        if kept >= promise + MARGIN:  # the preset of a weaker promise also keeps this one
             found[name] = cheapest
             continue
-        found[name] = own
-        for candidate in _cheaper(left, relighter.bundle, own):
+        found[name] = full
+        for candidate in _cheaper(left, relighter.bundle, full):
             worst = IDENTICAL
             for index in list(hardest):
                 case = cases[index]
@@ -141,7 +144,7 @@ def find(relighter: Relighter, cases: Sequence[Case], say: Callable[[str], None]
 
 
 def write_presets(bundle: Bundle, presets: Mapping[str, Preset]) -> Bundle:
-    """Put presets into a bundle, in place. Raises BundleError."""
+    """Write presets into a bundle, in place. Raises BundleError."""
     files = {name: bundle.folder / name for name in bundle.manifest.files}
     with tempfile.TemporaryDirectory() as folder:
         files[PRESETS] = Path(folder) / PRESETS
@@ -150,13 +153,13 @@ def write_presets(bundle: Bundle, presets: Mapping[str, Preset]) -> Bundle:
         return write_bundle(bundle.folder, bundle.manifest, files, overwrite=True)
 
 
-def _cheaper(left: Iterator[Preset], bundle: Bundle, own: Preset) -> Iterator[Preset]:
-    """Those that cost less than the reference."""
-    return (candidate for candidate in left if cost(candidate, bundle) < cost(own, bundle))
+def _cheaper(left: Iterator[Preset], bundle: Bundle, full: Preset) -> Iterator[Preset]:
+    """Return the candidates that cost less than the reference."""
+    return (candidate for candidate in left if cost(candidate, bundle) < cost(full, bundle))
 
 
 def _timed(relighter: Relighter, case: Case, how: Mapping[str, Any]) -> tuple[Relit, float]:
-    # The model remembers what it saw of its last photo: another one comes in between.
+    # The model caches its last photo, so another one is relit in between.
     relight(relighter, replace(case, photo=np.ascontiguousarray(case.photo[:, ::-1])), steps=1)
     start = perf_counter()
     relit = relight(relighter, case, **how)

@@ -1,4 +1,4 @@
-"""What a benchmark found: kept as JSON, shown as Markdown, compared with an older one."""
+"""The results of a benchmark as data, read from and written to JSON."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class BundleFacts:
 
 @dataclass(frozen=True)
 class PhotoFacts:
-    """A photo that was measured with; its file's hash and that of its strokes."""
+    """A photo of the benchmark, with the hashes of its file and of its strokes."""
 
     name: str
     sha256: str
@@ -50,13 +50,15 @@ class PhotoFacts:
 
 @dataclass(frozen=True)
 class Result:
-    """What one setting takes and costs.
+    """The time and the error of one setting.
 
-    ratio: the reference's total seconds by this one's. seconds, steps, start_up, start_up_cold, peak_bytes:
-    see `Measured`. step_flops: of one step, the mean over the photos. gemm_share: what a step reaches of the
-    machine's GEMM rate; product_share: of the rate at which its own matrix products and convolutions run;
-    both only where the CPU's cores all take part. copy_share: what the kernels reach of the
-    copy bandwidth of the memory that they work in, see `copy_share`. None: not known.
+    ratio: the reference's total seconds divided by this setting's.
+    seconds, steps, start_up, start_up_cold, peak_bytes: see `Measured`.
+    step_flops: the operations of one step, the mean over the photos.
+    gemm_share: the rate of a step as a share of the machine's GEMM rate, if all CPU cores take part.
+    product_share: the same, as a share of the rate of the network's own products.
+    copy_share: see the function `copy_share`.
+    None: unknown.
     """
 
     name: str
@@ -78,7 +80,7 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """One benchmark. results: the reference first. failed: setting -> why it could not be run."""
+    """One benchmark. results: the reference first. failed: setting -> why it failed."""
 
     format: Literal[3] = FORMAT
     machine: Machine
@@ -98,7 +100,7 @@ def make_report(
     photos: Sequence[Photo],
     repeats: int,
 ) -> Report:
-    """Put together what was measured; photos: the pairs', as read."""
+    """Combine the measurements into a report. photos: those of the pairs, as read."""
     reference = next(iter(outcome.measured))
     return Report(
         machine=machine,
@@ -117,22 +119,22 @@ def make_report(
 
 
 def copy_share(photo_bytes: float, seconds: float, bandwidth: float) -> float:
-    """The share of the copy bandwidth that the kernels reach.
+    """Return the share of the copy bandwidth that the kernels reach.
 
-    The least that they must move: read the photo to reduce it, read it again and write it to transfer light,
-    3 x photo_bytes. What they move besides, such as strokes and tables, is overhead.
+    The minimum is 3 x photo_bytes: the photo is read to reduce it, then read again and written to transfer
+    the light. Strokes and tables count as overhead.
     """
     return 3 * photo_bytes / seconds / bandwidth
 
 
 def write_report(path: Path, report: Report) -> None:
-    """Write it as JSON, whole or not at all. Raises InputError."""
+    """Write a complete JSON file or none. Raises InputError."""
     with replacing(path) as file:
         file.write((json.dumps(unparse(report), indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_report(path: Path) -> Report:
-    """Read what `write_report` wrote. Raises InputError for a file that is missing or something else."""
+    """Read a report. Raises InputError if the file is missing or is not a report."""
     check_readable(path, "benchmark")
     try:
         return parse(Report, read_json(path, MOST_BYTES))
@@ -141,7 +143,7 @@ def read_report(path: Path) -> Report:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Which (seconds, decibels) no other point beats in one and equals or beats in the other; by seconds."""
+    """Return the points (seconds, decibels) that no other point dominates, sorted by seconds."""
     front, best = [], float("-inf")
     for index in sorted(range(len(points)), key=lambda i: (points[i][0], -points[i][1])):
         if points[index][1] > best:
@@ -157,7 +159,7 @@ def _result(
     seconds = measured.seconds
     per_step = seconds["steps"] / measured.steps
     bundle = next(b for b in bundles if str(b.folder) == setting.bundle)
-    # Elsewhere one step may ask the network twice, or run a branch less than another.
+    # Other solvers may evaluate the network twice in a step, and intervals may skip a branch.
     alike = setting.solver == "euler" and not setting.interval
     each = [step_of(bundle, photo.size, setting.guidance) for photo in photos] if alike else []
     counts = {step: step_flops(bundle, step) for step in set(each) if step}

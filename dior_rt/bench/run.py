@@ -1,4 +1,4 @@
-"""Run the plan: every setting in processes of its own, by turns."""
+"""Run the settings of a plan in turns, each in its own process."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from dior_rt.images.photo import read_photo
 from dior_rt.presets import REFERENCE
 from dior_rt.records import parse, unparse
 
-Advance = Callable[[str], None]  # called before every run, with what runs
+Advance = Callable[[str], None]  # called before every run with its name
 
-# The worker runs the same dior_rt as this process, whatever lies in the working folder.
+# The worker imports the same dior_rt as this process, whatever the working directory contains.
 WORKER = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from dior_rt.bench.worker import main; main()"
 )
-#: Where compiled kernels are kept: by pyopencl, by PoCL, by NVIDIA's driver.
+#: The variables that locate compiled kernels: of pyopencl, of PoCL, of NVIDIA's driver.
 CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
 
 
@@ -39,9 +39,9 @@ CACHES = ("XDG_CACHE_HOME", "POCL_CACHE_DIR", "CUDA_CACHE_PATH")
 class Measured:
     """A setting's medians over the repeats, and the worst photo's difference from the reference.
 
-    seconds: of one photo, by stage, and their sum as "total". steps: as many as were taken. start_up_cold:
-    with no compiled kernel there yet; start_up: with all of them. peak_bytes: of memory, the median of the
-    repeats.
+    seconds: of one photo, by stage, and their sum as "total". steps: how many were taken.
+    start_up_cold: without any compiled kernel in a cache. start_up: with all of them.
+    peak_bytes: the median peak of memory.
     """
 
     seconds: dict[str, float]
@@ -54,7 +54,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Outcome:
-    """measured: by setting, in the plan's order. failed: why others could not be run, one sentence each."""
+    """measured: by setting, in the plan's order. failed: setting -> one sentence that says why it failed."""
 
     measured: dict[Setting, Measured]
     failed: dict[Setting, str]
@@ -62,7 +62,7 @@ class Outcome:
 
 
 def count_runs(settings: Sequence[Setting], repeats: int) -> int:
-    """How often `measure` calls `advance` where nothing fails."""
+    """Return how often `measure` calls `advance` if nothing fails."""
     return len(set(map(_host, settings))) + repeats * (len(settings) + 1)
 
 
@@ -77,8 +77,8 @@ def measure(
 ) -> Outcome:
     """Measure the settings, of which the first is the reference, and the machine's rooflines.
 
-    lpips: measures what the eye sees, as well. strict: raise DeviceError where any setting fails, not only
-    where the reference does. All are tried before the first is timed.
+    lpips: also measures the perceptual distance. strict: raise DeviceError if any setting fails, not only
+    if the reference does. All settings are tried before the first is timed.
     """
     reference, steps = settings[0], _steps(settings, pairs)
     with tempfile.TemporaryDirectory(prefix="dior-bench-") as scratch:
@@ -89,7 +89,7 @@ def measure(
         failed: dict[Setting, str] = {}
 
         def attempt(setting: Setting, plan: Setting, pairs: Sequence[Pair]) -> list[Sample]:
-            """Run `plan` on behalf of a setting, unless that has failed already."""
+            """Run `plan` for a setting, unless that setting has already failed."""
             if setting in failed:
                 return []
             try:
@@ -125,9 +125,9 @@ def measure(
 
 
 def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Sample:
-    """One run in a process of its own; its pictures go to `out`, its compiled kernels to `cache`.
+    """Run once in a new process. Its pictures go to `out`, its compiled kernels to `cache`.
 
-    Raises DeviceError with what the process says, or how it ended.
+    Raises DeviceError with the error of the process, or with its exit code.
     """
     job = Job(setting, tuple(pairs), str(out), time.monotonic())
     process = subprocess.run(
@@ -143,13 +143,13 @@ def run(setting: Setting, pairs: Sequence[Pair], out: Path, cache: Path) -> Samp
             raise DeviceError(answer["error"])
         return parse(Sample, answer)
     except (ValueError, IndexError, TypeError):
-        said = process.stderr.strip().splitlines() or ["it left no word"]
+        output = process.stderr.strip().splitlines() or ["it printed nothing"]
         where = f"{setting.device} and {setting.ops}"
-        raise DeviceError(f"The run on {where} ended with code {process.returncode}: {said[-1]}.") from None
+        raise DeviceError(f"The run on {where} ended with code {process.returncode}: {output[-1]}.") from None
 
 
 def _steps(settings: Sequence[Setting], pairs: Sequence[Pair]) -> dict[Step, Bundle]:
-    """The steps whose products' rate is measured, as all cores of the CPU take part, and their bundles."""
+    """Return the steps that all CPU cores work on, and their bundles: those whose products are measured."""
     sizes = {read_photo(Path(pair.photo)).size for pair in pairs}
     found: dict[Step, Bundle] = {}
     for folder, guidance in {(one.bundle, one.guidance) for one in settings if one.takes_whole_cpu()}:
@@ -160,7 +160,7 @@ def _steps(settings: Sequence[Setting], pairs: Sequence[Pair]) -> dict[Step, Bun
 
 
 def _host(setting: Setting) -> Setting:
-    """What a start-up depends on: the setting with all else as small as can be."""
+    """Return the part of a setting that its start-up depends on; everything else is minimal."""
     return replace(
         setting,
         preset=REFERENCE,
@@ -187,7 +187,7 @@ def _differences(
 
 def _summary(samples: Sequence[Sample], cold: Sample, difference: Difference) -> Measured:
     seconds = {stage: median(sample.seconds[stage] for sample in samples) for stage in STAGES}
-    # The median of the sums: stages that are slow by turns must not cancel out.
+    # The total is the median of the sums, so that stages that are slow in different runs do not cancel out.
     seconds["total"] = median(sum(sample.seconds.values()) for sample in samples)
     peaks = [sample.peak_bytes for sample in samples if sample.peak_bytes is not None]
     return Measured(

@@ -1,4 +1,4 @@
-"""A photo and strokes made by arithmetic, the same everywhere, for who has none at hand."""
+"""Make a synthetic photo with strokes, the same on every machine, for benchmarks without photos."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from dior_rt.bench.worker import Pair
 from dior_rt.images.photo import Photo, write_photo
 
-#: Coordinates are shares of the width and the height, widths are shares of the width.
+#: Coordinates are fractions of the width and the height; widths are fractions of the width.
 STROKES = (
     ([(0.15, 0.25), (0.25, 0.6), (0.2, 0.8)], 0.05, (1.0, 0.7, 0.35), 2.5),
     ([(0.7, 0.2), (0.8, 0.5)], 0.06, (0.1, 0.15, 0.3), 0.5),
@@ -20,7 +20,7 @@ STROKES = (
 
 
 def write_scene(folder: Path, megapixels: float) -> Pair:
-    """Write a photo of 3:2, shaded balls before a textured wall lit from the left, and strokes for it."""
+    """Write a 3:2 photo of shaded balls before a textured wall lit from the left, and strokes for it."""
     height = max(1, round(math.sqrt(megapixels * 1e6 / 1.5)))
     width = max(1, round(1.5 * height))
     photo, strokes = folder / f"synthetic-{megapixels:g}mp.png", folder / "strokes.json"

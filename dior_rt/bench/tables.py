@@ -1,4 +1,4 @@
-"""A report as Markdown."""
+"""Show a report as Markdown."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dior_rt.bench.report import Report, Result
 
 
 def as_markdown(report: Report) -> str:
-    """The whole report: ratios and errors first, then where the time goes, then what it was measured on."""
+    """Return the report: ratios and errors, then where the time goes, then the machine."""
     speed = [
         [
             result.name,
@@ -50,7 +50,7 @@ def as_markdown(report: Report) -> str:
 
 
 def compare(new: Report, old: Report) -> str:
-    """The settings that both reports have: new by old, and what else is not the same."""
+    """Return new divided by old for the settings in both reports, and what else differs."""
     before = {result.name: result for result in old.results}
     rows = [
         [
@@ -65,13 +65,13 @@ def compare(new: Report, old: Report) -> str:
         if result.name in before
     ]
     heads = ["new / old", "seconds", "a step", "start-up", "peak memory", "PSNR, dB"]
-    notes = [f"- not the same in both: {', '.join(changed)}" for changed in [_changed(new, old)] if changed]
+    notes = [f"- differs: {', '.join(changed)}" for changed in [_changed(new, old)] if changed]
     return "\n\n".join([table(heads, rows) if rows else "No setting is in both benchmarks.", *notes])
 
 
 def _facts(report: Report) -> list[str]:
     machine, rooflines, reference = report.machine, report.rooflines, report.results[0]
-    memory = "memory not known" if machine.memory_bytes is None else f"{machine.memory_bytes / 2**30:.1f} GiB"
+    memory = "unknown memory" if machine.memory_bytes is None else f"{machine.memory_bytes / 2**30:.1f} GiB"
     setting = reference.setting
     copies = ", ".join(f"{name} {rate / 1e9:.1f} GB/s" for name, rate in rooflines.copy.items())
     return [
@@ -99,7 +99,7 @@ def _changed(new: Report, old: Report) -> list[str]:
         "photos": (new.photos, old.photos),
         "reference": (new.results[0].setting, old.results[0].setting),
     }
-    return [name for name, (ours, theirs) in pairs.items() if ours != theirs]
+    return [name for name, (new, old) in pairs.items() if new != old]
 
 
 def _decibels(result: Result) -> str:
@@ -116,7 +116,7 @@ def _ratio(new: float | None, old: float | None) -> str:
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Markdown, its columns aligned."""
+    """Return a Markdown table with aligned columns."""
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = [heads, ["-" * width for width in widths], *rows]
     return "\n".join(

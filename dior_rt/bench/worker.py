@@ -1,6 +1,7 @@
-"""One run of one setting, in a process of its own, so that its peak of memory and its start-up are its own.
+"""Run one setting once, in a process whose peak memory and start-up time are measured.
 
-Reads a Job as JSON from its input; the last line of its output is a Sample, or {"error": sentence}.
+The process reads a Job as JSON from its input. The last line of its output is a Sample, or {"error":
+sentence}.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from dior_rt.stopwatch import Stopwatch
 
 @dataclass(frozen=True)
 class Pair:
-    """A photo and the light drawn on it, as files."""
+    """The files of a photo and of its strokes."""
 
     photo: str
     strokes: str
@@ -27,8 +28,8 @@ class Pair:
 
 @dataclass(frozen=True)
 class Job:
-    """What to do. out: the folder for the pictures, 0.png and so on. spawned: `time.monotonic()` of the
-    parent when it started this process; the clock is that of the whole system."""
+    """One run. out: the folder for the pictures 0.png, 1.png ... spawned: `time.monotonic()` of the parent
+    when it started this process; all processes share this clock."""
 
     setting: Setting
     pairs: tuple[Pair, ...]
@@ -38,12 +39,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Sample:
-    """What one run took.
+    """The measurements of one run.
 
-    seconds: for one photo, the mean over the photos, by stage: read, kernels, steps, transfer, write.
-    steps: as many as were taken, the mean over the photos.
-    start_up: from the start of the process to the end of the first step, loading included.
-    peak_bytes: the most memory that the process held at once; None where the system does not say.
+    seconds: per photo, the mean over the photos, by stage: read, kernels, steps, transfer, write.
+    steps: how many were taken, the mean over the photos.
+    start_up: from the start of the process to the end of the first step, including loading.
+    peak_bytes: the most memory that the process held at once; None if the system does not report it.
     """
 
     seconds: dict[str, float]
@@ -58,7 +59,8 @@ STAGES = ("read", "kernels", "steps", "transfer", "write")
 def work(job: Job) -> Sample:
     """Relight every pair once to warm up, with a single step, and once for the clock.
 
-    The warm-up is of the photo's mirror image, as the model remembers what it saw of its last photo."""
+    The warm-up uses the photo's mirror image, because the model caches its last photo.
+    """
     import numpy as np
 
     from dior_rt.relight import Relighter
@@ -93,9 +95,9 @@ def work(job: Job) -> Sample:
 
 
 def peak_memory() -> int | None:
-    """The most bytes of memory that this process held at once."""
+    """Return the most bytes of memory that this process held at once."""
     try:
-        # Not getrusage where there is better: on Linux its figure begins with the parent's at the fork.
+        # On Linux, getrusage starts with the parent's peak at the fork, so VmHWM is better.
         status = Path("/proc/self/status").read_text()
         return next(int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM"))
     except (OSError, StopIteration):
@@ -109,7 +111,7 @@ def peak_memory() -> int | None:
 
 
 def main() -> None:
-    """The process."""
+    """Run the process."""
     try:
         answer = unparse(work(parse(Job, json.load(sys.stdin))))
     except DiorError as error:

@@ -36,6 +36,7 @@ def run(arguments: Sequence[str]) -> int:
 
     0; 2 for what the user can mend; 70 for what nobody foresaw; 130 for Ctrl-C.
     """
+    caught: Exception
     try:
         return _run(arguments)
     except DiorError as error:

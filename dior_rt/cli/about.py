@@ -85,10 +85,10 @@ def info(
     }
     table(list(rows.items()))
     say("")
-    lines: list[tuple[str, object]] = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
+    here: list[tuple[str, object]] = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
     for default in defaults:
         name = f"{default.command} {default.setting}" if default.command else default.setting
         value = default.value if isinstance(default.value, str) else " ".join(default.value)
-        lines.append((name, f"{value} (from {default.source})"))
-    lines += [(name, "no setting has this variable") for name in unknown_variables()]
-    table(lines)
+        here.append((name, f"{value} (from {default.source})"))
+    here += [(name, "no setting has this variable") for name in unknown_variables()]
+    table(here)

@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from dior_rt import __version__
-from dior_rt.cli.extras import needs_extra
+from dior_rt.extras import needs_extra
 
 STYLE: dict[str, Any] = {
     "rich_markup_mode": None,

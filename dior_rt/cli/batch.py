@@ -165,7 +165,7 @@ def batch(
             journal.failed(refused.name, refused.reason)
         if planned.jobs:
             recipe = Recipe(sampling, key, Encoding(quality, int(bits) if bits else None), sidecar)
-            with closing(run_engine(planned.jobs, recipe, journal.begin)) as outcomes:
+            with closing(run_engine(planned.jobs, recipe, journal.begin)) as outcomes:  # type: ignore[type-var]
                 for outcome in outcomes:
                     if outcome.error is None:
                         assert outcome.photo and outcome.strokes and outcome.output

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dior_rt.cli import options
-from dior_rt.cli.extras import needs_extra
 from dior_rt.errors import DeviceError, InputError
+from dior_rt.extras import needs_extra
 
 if TYPE_CHECKING:
     from dior_rt.bench.difference import Distance

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from dior_rt.cli import options
-from dior_rt.cli.extras import needs_extra
 from dior_rt.cli.text import table
 from dior_rt.errors import InputError
+from dior_rt.extras import needs_extra
 from dior_rt.files import reason
 
 if TYPE_CHECKING:
@@ -91,15 +91,17 @@ def export(
                 "Qwen-Image-Edit has its own guidance, noise and schedule; those options are for training's."
             )
         with needs_extra("qwen", command="export"):
-            from dior_rt.export.qwen.bundle import Recipe, export_qwen
+            from dior_rt.export.qwen.bundle import QwenExportConfig, export_qwen
             from dior_rt.export.qwen.lora import Lora
             from dior_rt.export.qwen.sources import Files
 
-            recipe = Recipe(precision=weights, steps=steps, free_steps=free_steps, prompt_cache=prompt_cache)
+            config = QwenExportConfig(
+                precision=weights, steps=steps, free_steps=free_steps, prompt_cache=prompt_cache
+            )
             bundle = export_qwen(
                 source,
                 out,
-                recipe.few_steps(few_steps) if few_steps else recipe,
+                config.few_steps(few_steps) if few_steps else config,
                 loras=[Lora(*_path_and_strength(one)) for one in lora],
                 files=Files(transformer, vae, text_encoder),
                 overwrite=overwrite,
@@ -112,14 +114,13 @@ def export(
         if len(lora) > 1:
             raise InputError("A checkpoint of training takes one LoRA.")
         with needs_extra("export"):
-            from dior_rt.export.mini import Recipe as MiniRecipe
-            from dior_rt.export.mini import export_checkpoint
+            from dior_rt.export.mini import MiniExportConfig, export_checkpoint
 
             bundle = export_checkpoint(
                 source,
                 out,
                 lora=Path(lora[0]) if lora else None,
-                recipe=MiniRecipe(
+                config=MiniExportConfig(
                     schedule=_schedule(8.0 if shift is None else shift),
                     steps=steps,
                     guidance=1.0 if guidance is None else guidance,

@@ -141,7 +141,7 @@ def relight(
     notices = [
         *(f"{photo}: {notice}" for notice in picture.notices),
         *(f"{strokes}: {notice}" for notice in drawing.notices),
-        *([relit.notice] if relit.notice else []),
+        *filter(None, [relit.notice, relighter.ops_notice]),
         *lost,
     ]
     if quiet:

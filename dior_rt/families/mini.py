@@ -1,7 +1,7 @@
-"""Mini: the small network that ships in the package. It predicts light on a grid of some 64 x 64 cells.
+"""Mini: the small network that ships in the package. It predicts light on about 64 x 64 cells.
 
 Data variable x0 of the flow: 4 (relit - photo) to relight, 2 encode(Lumi map) - 1 to estimate, where relit
-and photo are sRGB-encoded and encode(L) = log(1 + 8 L) / log 9: in both, squared error is what the eye sees.
+and photo are sRGB-encoded and encode(L) = log(1 + 8 L) / log 9. In both, squared error is roughly perceptual.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dior_rt.bundle import Bundle
 from dior_rt.engine import Engine, open_engine
@@ -17,19 +18,19 @@ from dior_rt.errors import BundleError
 from dior_rt.families import Mode
 from dior_rt.flow.sampler import Array, Condition, Velocity, guided
 from dior_rt.flow.schedule import ShiftSchedule
-from dior_rt.kernels import Strokes
+from dior_rt.kernels import Ops, Strokes
+from dior_rt.kernels.color import linear_to_srgb
+from dior_rt.light import lumi_from_x0, relit_from_x0
 
 MODES: Final[dict[Mode, int]] = {"relight": 0, "estimate": 1}
-RELIT_SCALE: Final = np.float32(4)
-LUMI_SCALE: Final = np.float32(8)
-SEEN: Final = ("photo", "light", "mask")  # of a condition, what the graph "encode" looks at
+SEEN: Final = ("photo", "light", "mask")  # the inputs of the graph "encode" in a condition
 
 
 class Mini:
-    """A mini bundle, loaded on a device: the `Family` whose condition is the network's inputs, by name."""
+    """A mini bundle, loaded on a device. Its condition is the network's inputs by name."""
 
     def __init__(self, bundle: Bundle, device: str = "auto", threads: int | None = None) -> None:
-        """Raises BundleError for a bundle that is no complete mini, and what `open_engine` raises."""
+        """Load the bundle. Raises BundleError if it is no complete mini, and what `open_engine` raises."""
         grid, schedule = bundle.manifest.grid, bundle.manifest.schedule
         if bundle.manifest.family != "mini" or grid is None or not isinstance(schedule, ShiftSchedule):
             raise BundleError(f"{bundle.folder} is no complete bundle of the family mini.")
@@ -42,6 +43,10 @@ class Mini:
 
     def raster(self, height: int, width: int) -> tuple[int, int]:
         return self._grid.shape(height, width)
+
+    def reduce_photo(self, pixels: NDArray, raster: tuple[int, int], ops: Ops) -> tuple[Array, Array]:
+        linear = ops.reduce_photo(pixels, raster)
+        return linear, np.clip(linear_to_srgb(linear), 0, 1).astype(np.float32)
 
     def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
         return encode(photo, strokes, mode)
@@ -56,15 +61,14 @@ class Mini:
         return self._graphs.guided(condition, guidance)
 
     def decode_relit(self, x0: Array, condition: Condition) -> Array:
-        return _pixels(np.clip(condition["photo"] + x0 / RELIT_SCALE, 0, 1))
+        return _pixels(relit_from_x0(x0, condition["photo"]))
 
     def decode_lumi(self, x0: Array, condition: Condition) -> Array:
-        encoded = np.maximum((_pixels(x0) + 1) / 2, 0)
-        return np.expm1(encoded * np.log1p(LUMI_SCALE)) / LUMI_SCALE
+        return lumi_from_x0(_pixels(x0))
 
 
 def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
-    """The network's inputs for one photo (h, w, 3), sRGB 0..1, and strokes of the same grid, or None."""
+    """Return the network's inputs for a photo (h, w, 3), sRGB 0..1, and strokes on the same grid, or None."""
     nothing = Strokes(np.zeros_like(photo), np.zeros(photo.shape[:2], np.float32))
     strokes = strokes or nothing
     return {
@@ -76,27 +80,27 @@ def encode(photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
 
 
 def null(condition: Condition) -> Condition:
-    """The condition without its strokes: the null branch of guidance."""
+    """Return the condition without strokes: the null branch of guidance."""
     return {**condition, **{name: np.zeros_like(condition[name]) for name in ("light", "mask")}}
 
 
 class Graphs:
-    """Mini's two graphs. encode: what photo and strokes say, run once; velocity: run at every step.
+    """Mini's two graphs. encode: the features of photo and strokes, run once. velocity: run at every step.
 
-    What the photo alone says is remembered until another comes: who paints draws on one photo many times.
+    The features of the photo alone are cached for the last photo, because users relight one photo many times.
     """
 
     def __init__(self, encode: Engine, velocity: Engine) -> None:
         self.encode, self.velocity = encode, velocity
-        self._blank, self._own_light = lru_cache(1)(self._look), lru_cache(1)(self._estimate)
+        self._blank, self._source_light = lru_cache(1)(self._look), lru_cache(1)(self._estimate)
 
     def guided(self, condition: Condition, guidance: float) -> Velocity:
-        """The velocity under a condition, and guided away from none: see `dior_rt.flow.sampler.guided`."""
+        """Return the guided velocity under a condition: see `dior_rt.flow.sampler.guided`."""
         drawn, blank = self.branches(condition)
         return guided(self.bind, drawn, blank, guidance)
 
     def bind(self, features: Condition) -> Velocity:
-        """The velocity by features, which go to the device once."""
+        """Return the velocity for features, which are copied to the device once."""
         binding = self.velocity.bind(features)
 
         def velocity(x: Array, sigma: float) -> Array:
@@ -105,30 +109,32 @@ class Graphs:
         return velocity
 
     def branches(self, condition: Condition) -> tuple[Condition, Condition]:
-        """What a step is told of photo and strokes, and of the photo alone."""
+        """Return the features of photo and strokes, and those of the photo alone."""
         mode, seen = {"mode": condition["mode"]}, {name: condition[name] for name in SEEN}
         photo = seen["photo"].shape, seen["photo"].tobytes()
         blank = drawn = self._blank(*photo)
         if seen["mask"].any():
-            drawn = self.encode.run({**seen, "own": self._own_light(*photo)})
+            drawn = self.encode.run({**seen, "own": self._source_light(*photo)})
         return {**mode, **drawn}, {**mode, **blank}
 
     def _look(self, shape: tuple[int, ...], photo: bytes) -> Condition:
-        """What the graph "encode" says of a photo alone."""
+        """Return the features of a photo alone, from the graph "encode"."""
         pixels = np.frombuffer(photo, np.float32).reshape(shape)
         seen = {"photo": pixels, "light": np.zeros_like(pixels), "mask": np.zeros_like(pixels[:, :1])}
         return self.encode.run({**seen, "own": np.zeros_like(pixels)})
 
     def _estimate(self, shape: tuple[int, ...], photo: bytes) -> Array:
-        """The light on a photo, encoded, which what is drawn is measured against: an evaluation without
-        strokes from a silent state."""
+        """Return the encoded light on a photo, against which drawn light is measured.
+
+        This is one evaluation without strokes from a state of zeros.
+        """
         asked: Condition = {
             "x": np.zeros(shape, np.float32),
             "sigma": np.ones(shape[0], np.float32),
             "mode": np.full(shape[0], MODES["estimate"], np.int64),
         }
         velocity: Array = self.velocity.run({**asked, **self._blank(shape, photo)})["velocity"]
-        # From x = 0 at sigma = 1 it is -x0, and x0 is 2 own - 1.
+        # At x = 0 and sigma = 1 the velocity is -x0, and x0 is 2 own - 1.
         return (np.float32(1) - velocity) / np.float32(2)
 
 

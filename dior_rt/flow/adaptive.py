@@ -1,10 +1,10 @@
-"""Adaptive steps: as many as a picture needs to come out within a tolerance.
+"""Adaptive steps: take as many steps as a picture needs to stay within a tolerance.
 
-The image x0 that the flow points at is taken to move on a line in sigma. With d(x / sigma) = x0 d(1 / sigma)
-that gives the state in closed form at every sigma from 1 down to 0; see `glide`. At the end of a step the
-velocity says where the image is in truth: how far from where it was expected is the step's error, in the
-picture's own units, and the step is corrected by it. The estimate costs no evaluation of its own (Milne's
-device; Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, III.7).
+The method assumes that the image x0 that the flow points at moves linearly in sigma. With
+d(x / sigma) = x0 d(1 / sigma), that gives the state in closed form at every sigma from 1 down to 0; see
+`glide`. At the end of a step, the velocity gives the true image. Its distance from the expected image is
+the error of the step, in the picture's own units, and the step is corrected by it. The estimate needs no
+extra evaluation (Milne's device; Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, III.7).
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ import numpy as np
 from dior_rt.flow.sampler import State, in_float32
 from dior_rt.flow.solvers import Array, Velocity
 
-Distance = Callable[[Array, Array], float]  # of two images x0, in the units of the tolerance
+Distance = Callable[[Array, Array], float]  # between two images x0, in the units of the tolerance
 
-FIRST = 1 / 40  # of the way: the first step
-LONGEST = 1 / 6  # of the way: what happens within a step goes unseen
-LONGER, SHORTER = 2.0, 0.2  # bounds of a step by the one before
-MARGIN = 0.9  # of the step that the estimate would allow
-RETRY = 0.8  # a step whose successor would be shorter than this share of it is taken again
+FIRST = 1 / 40  # the first step, as a share of the way
+LONGEST = 1 / 6  # the longest step, as a share of the way: nothing within a step is measured
+LONGER, SHORTER = 2.0, 0.2  # bounds of a step relative to the one before
+MARGIN = 0.9  # share of the step that the estimate would allow
+RETRY = 0.8  # a step is repeated if the next one would be shorter than this share of it
 
 
 def sample_within(
     tolerance: float, distance: Distance, velocity: Velocity, noise: Array, sigmas: Array
 ) -> Iterator[State]:
-    """Walk x from `noise` at sigmas[0] to 0 = sigmas[-1], stopping only at as many of the sigmas as needed.
+    """Walk x from `noise` at sigmas[0] to 0 = sigmas[-1], stopping at as few of the sigmas as needed.
 
-    Each step may err by its share of the way, step / steps, times the tolerance; errors are taken to reach
-    the end as large as they arose. The state's `step` counts sigmas passed: it jumps. The last step, to 0
-    where there is no velocity, is as short as the schedule's own and goes straight.
+    The error of each step may be its share of the way, step / steps, times the tolerance. The method
+    assumes that errors reach the end undiminished. The state's `step` counts the sigmas passed, so it
+    jumps. The last step leads to 0, where there is no velocity; it is as short as the schedule's last step,
+    and straight.
     """
     velocity, steps = in_float32(velocity), len(sigmas) - 1
     sigma, x, at, leap = float(sigmas[0]), noise, 0, max(1, round(FIRST * steps))
@@ -61,7 +62,7 @@ def sample_within(
 
 
 def glide(x: Array, x0: Array, drift: Array, sigma: float, then: float) -> Array:
-    """The state at sigma' = `then` > 0 where the image moves from x0 by `drift` a unit of sigma:
+    """Return the state at sigma' = `then` > 0 if the image moves from x0 by `drift` per unit of sigma:
 
     x' = r x + (1 - r) x0 + w (sigma' - sigma) drift,    r = sigma' / sigma,  w = `weight`
     """
@@ -70,7 +71,7 @@ def glide(x: Array, x0: Array, drift: Array, sigma: float, then: float) -> Array
 
 
 def weight(sigma: float, then: float) -> float:
-    """The share of the image's movement in a step that reaches the state: 1 + r log(r) / (1 - r).
+    """Return the share of the image's movement in a step that reaches the state: 1 + r log(r) / (1 - r).
 
     It is (1 - r) / 2 for short steps, and 1 for one that ends at 0.
     """

@@ -1,8 +1,8 @@
-"""The sampler: from noise to image along the flow, by one of the solvers.
+"""The sampler: walk from noise to image along the flow, with one of the solvers.
 
 sigma is flow time, 1 = noise and 0 = image: x = (1 - sigma) x0 + sigma eps, and the velocity is
-v = dx/dsigma = eps - x0. The state is float32 whatever the network computes in. `sample` is a generator:
-progress, previews and cancelling belong to the caller.
+v = dx/dsigma = eps - x0. The state is float32, whatever dtype the network computes in. `sample` is a
+generator: the caller handles progress, previews and cancelling.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from dior_rt.flow.solvers import MEMORY, SOLVERS, Array, Past, Velocity
 
-Condition = Mapping[str, NDArray]  # what the network sees besides x and sigma; its arrays lead with the batch
+Condition = Mapping[str, NDArray]  # inputs besides x and sigma; the first axis is the batch
 
 
 @dataclass(frozen=True)
 class State:
-    """Where the sampler stands after `step` of `steps`: its state x, and the image x0 that it points at."""
+    """The sampler after `step` of `steps`: its state x, and the image x0 that the flow points at."""
 
     step: int
     steps: int
@@ -31,21 +31,23 @@ class State:
 
 
 def draw_noise(seed: int, shape: tuple[int, ...]) -> Array:
-    """Standard normal noise, drawn on the host by NumPy's PCG64: a seed means the same on every device."""
+    """Return standard normal noise, drawn on the host by NumPy's PCG64: the same for a seed on every
+    device."""
     return np.random.Generator(np.random.PCG64(seed)).standard_normal(shape, dtype=np.float32)
 
 
 def guide(v_null: Array, v_cond: Array, scale: float) -> Array:
-    """Classifier-free guidance, v_null + scale (v_cond - v_null) (Ho & Salimans, arXiv 2207.12598)."""
+    """Return v_null + scale (v_cond - v_null): classifier-free guidance (Ho & Salimans, arXiv 2207.12598)."""
     return v_null + np.float32(scale) * (v_cond - v_null)
 
 
 def guided(
     bind: Callable[[Condition], Velocity], condition: Condition, null: Condition, scale: float
 ) -> Velocity:
-    """The guided velocity. `bind` readies the network for a condition; both branches run as one batch.
+    """Return the guided velocity. `bind` prepares the network for a condition; both branches run as one
+    batch.
 
-    Scale 1 is the condition alone and scale 0 the null alone: they cost one branch.
+    Scale 1 uses the condition alone, and scale 0 the null branch alone. Both cost one branch.
     """
     if scale == 1:
         return bind(condition)
@@ -61,9 +63,10 @@ def guided(
 
 
 def between(low: float, high: float, inside: Velocity, outside: Velocity) -> Velocity:
-    """`inside` where low <= sigma <= high, else `outside`.
+    """Return `inside` where low <= sigma <= high, and `outside` elsewhere.
 
-    Guidance in an interval (arXiv 2404.07724) is the guided velocity inside and the condition's outside.
+    For guidance in an interval (arXiv 2404.07724), pass the guided velocity as `inside` and the conditional
+    one as `outside`.
     """
 
     def velocity(x: Array, sigma: float) -> Array:
@@ -75,7 +78,7 @@ def between(low: float, high: float, inside: Velocity, outside: Velocity) -> Vel
 def sample(velocity: Velocity, noise: Array, sigmas: Array, solver: str = "euler") -> Iterator[State]:
     """Walk x from `noise` at sigmas[0] to sigmas[-1], yielding the state after every step.
 
-    solver: a name of `SOLVERS`; KeyError for another.
+    solver: a name in `SOLVERS`. Raises KeyError for other names.
     """
     method, steps = SOLVERS[solver], len(sigmas) - 1
     velocity = in_float32(velocity)
@@ -88,5 +91,5 @@ def sample(velocity: Velocity, noise: Array, sigmas: Array, solver: str = "euler
 
 
 def in_float32(velocity: Velocity) -> Velocity:
-    """The velocity of a network that may compute in something else."""
+    """Return the velocity in float32, whatever dtype the network computes in."""
     return lambda x, sigma: velocity(x, sigma).astype(np.float32, copy=False)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_SHIFT = 1e4  # of more, float32 would round neighbours of a thousand sigmas next to 1 to the same number
+MOST_SHIFT = 1e4  # above it, float32 cannot tell a thousand sigmas next to 1 apart
 
 
 @dataclass(frozen=True)
 class ShiftSchedule:
-    """sigma = s u / (1 + (s - 1) u) over u even from 1 to 0 (Stable Diffusion 3, arXiv 2403.03206, eq. 23).
+    """sigma = s u / (1 + (s - 1) u) for u in even steps from 1 to 0 (Stable Diffusion 3, arXiv 2403.03206,
+    eq. 23).
 
-    shift s, 0 < s <= MOST_SHIFT: above 1 more of the steps are spent near noise; 1 makes even steps.
+    shift: 0 < s <= MOST_SHIFT. Above 1, more of the steps are near noise; 1 makes even steps.
     """
 
     shift: float
@@ -27,16 +28,15 @@ class ShiftSchedule:
             raise ValueError(f"shift must be a positive number up to {MOST_SHIFT:g}, not {self.shift}")
 
     def sigmas(self, steps: int) -> NDArray[np.float32]:
-        """steps + 1 falling values, the first 1 and the last 0."""
-        u = _even(steps)
-        return np.append(self.shift * u / (1 + (self.shift - 1) * u), 0.0).astype(np.float32)
+        """Return steps + 1 falling values, the first 1 and the last 0."""
+        return np.append(shift_sigma(_even(steps), self.shift), 0.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class DynamicShiftSchedule:
     """The shift grows with the picture: sigma = e^mu / (e^mu + 1/u - 1), stretched to end at `terminal`.
 
-    mu runs on the straight line through (base_tokens, base_shift) and (max_tokens, max_shift); after the
+    mu lies on the straight line through (base_tokens, base_shift) and (max_tokens, max_shift); after the
     stretch the last sigma before 0 is `terminal`. This is diffusers' FlowMatchEulerDiscreteScheduler with
     use_dynamic_shifting, time_shift_type "exponential" and shift_terminal.
     """
@@ -55,14 +55,22 @@ class DynamicShiftSchedule:
             raise ValueError("terminal must lie between 0 and 1")
 
     def sigmas(self, steps: int, tokens: int) -> NDArray[np.float32]:
-        """steps + 1 falling values, the first 1 and the last 0, for a picture of `tokens` latent patches."""
+        """Return steps + 1 falling values, from 1 to 0, for a picture of `tokens` latent patches."""
         slope = (self.max_shift - self.base_shift) / (self.max_tokens - self.base_tokens)
         shift = math.exp(self.base_shift + slope * (tokens - self.base_tokens))
         u = _even(steps)
         sigma = shift / (shift + 1 / u - 1)
-        if steps > 1:  # a single step has no last sigma but its first, and that is pure noise
+        if steps > 1:  # the last sigma of a single step is its first, which is pure noise
             sigma = 1 - (1 - sigma) * (1 - self.terminal) / (1 - sigma[-1])
         return np.append(sigma, 0.0).astype(np.float32)
+
+
+def shift_sigma(u: Any, shift: float) -> Any:
+    """Return s u / (1 + (s - 1) u): even flow time u, moved towards noise by a shift s > 1.
+
+    u: a NumPy array, a torch tensor or a float; training draws its sigmas with the same function.
+    """
+    return shift * u / (1 + (shift - 1) * u)
 
 
 Schedule = ShiftSchedule | DynamicShiftSchedule

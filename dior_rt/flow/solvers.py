@@ -1,8 +1,8 @@
 """Solvers: one step along the flow dx/dsigma = v(x, sigma), from a sigma to a smaller one.
 
-A step is a pure function of the state, of the two sigmas, and of the points where the velocity was asked
-before. Every method is Euler's step with a better velocity, or, which is the same, towards a better image
-D: x + (sigma' - sigma) (x - D) / sigma. `SOLVERS` names them all.
+A step is a pure function of the state, the two sigmas, and the points where the velocity was evaluated
+before. Every method is Euler's step with a better velocity or, equivalently, towards a better image D:
+x + (sigma' - sigma) (x - D) / sigma. `SOLVERS` lists all methods.
 """
 
 from __future__ import annotations
@@ -21,33 +21,36 @@ Velocity = Callable[[Array, float], Array]  # (x, sigma) -> v, of x's shape; sig
 
 @dataclass(frozen=True)
 class Point:
-    """Where the velocity was asked: sigma, the state x there, and v(x, sigma)."""
+    """An evaluation of the velocity: sigma, the state x, and v(x, sigma)."""
 
     sigma: float
     x: Array
     v: Array
 
     def at(self, sigma: float) -> Array:
-        """The state at another sigma, straight ahead."""
+        """Return the state at another sigma on the straight line through this point."""
         return self.x + (sigma - self.sigma) * self.v
 
     @property
     def x0(self) -> Array:
-        """The image straight ahead."""
+        """The image at the end of that line."""
         return self.at(0.0)
 
 
 Past = tuple[Point, ...]  # the last points, newest first
 Step = Callable[[Velocity, Array, float, float, Past], tuple[Array, Point]]
 
-MEMORY: Final = 2  # points that a step looks back at
+MEMORY: Final = 2  # how many points a step looks back at
 
 
 @dataclass(frozen=True)
 class Solver:
-    """step: (velocity, x, sigma, sigma', past) -> (x at sigma', the point it started from). asks: how often
-    it asks the velocity in a step; the step that reaches sigma' = 0 may ask less. order: of convergence, at
-    least."""
+    """A method.
+
+    step: (velocity, x, sigma, sigma', past) -> (x at sigma', the point it started from).
+    asks: evaluations of the velocity per step; the step that reaches sigma' = 0 may need fewer.
+    order: the least order of convergence.
+    """
 
     step: Step
     order: int
@@ -55,7 +58,7 @@ class Solver:
 
 
 def euler(velocity: Velocity, x: Array, sigma: float, then: float, past: Past) -> tuple[Array, Point]:
-    """Euler's method, which for flows is DDIM's: straight ahead."""
+    """Euler's method, which is DDIM for flows: one straight step."""
     here = Point(sigma, x, velocity(x, sigma))
     return here.at(then), here
 
@@ -73,7 +76,7 @@ def heun(velocity: Velocity, x: Array, sigma: float, then: float, past: Past) ->
 
 
 def adams(velocity: Velocity, x: Array, sigma: float, then: float, past: Past) -> tuple[Array, Point]:
-    """Adams' and Bashforth's two-step method with steps of any length: the velocity on a line in sigma."""
+    """Two-step Adams-Bashforth with steps of any length: the velocity is extrapolated linearly in sigma."""
     here = Point(sigma, x, velocity(x, sigma))
     if not past:
         return here.at(then), here
@@ -82,17 +85,21 @@ def adams(velocity: Velocity, x: Array, sigma: float, then: float, past: Past) -
 
 
 def dpmpp_2m(velocity: Velocity, x: Array, sigma: float, then: float, past: Past) -> tuple[Array, Point]:
-    """DPM-Solver++(2M): the image x0 on a line in lambda = log((1 - sigma) / sigma) (arXiv 2211.01095).
+    """DPM-Solver++(2M): the image x0 is extrapolated linearly in lambda = log((1 - sigma) / sigma).
 
-    lambda is infinite at sigma 1 and 0, where the line is level: Euler's step.
+    See arXiv 2211.01095. lambda is infinite at sigma 1 and 0; there the extrapolation is constant, Euler's
+    step.
     """
     here = Point(sigma, x, velocity(x, sigma))
     return _dpmpp_2m(here, then, past), here
 
 
 def unipc(velocity: Velocity, x: Array, sigma: float, then: float, past: Past) -> tuple[Array, Point]:
-    """UniPC of order 2 with B(h) = e^h - 1 (arXiv 2302.04867): DPM-Solver++(2M) predicts, and the velocity
-    asked at the prediction also corrects the step that led there, without being asked again."""
+    """UniPC of order 2 with B(h) = e^h - 1 (arXiv 2302.04867).
+
+    DPM-Solver++(2M) predicts. The velocity at the prediction also corrects the step that led there, without
+    another evaluation.
+    """
     x0 = Point(sigma, x, velocity(x, sigma)).x0
     if past:
         x = _correct(x0, sigma, past)
@@ -110,7 +117,7 @@ SOLVERS: Final = {
 
 
 def slope(here: Point, before: Point) -> Array:
-    """The velocity's change by sigma between two points."""
+    """Return the change of the velocity per unit of sigma between two points."""
     return (here.v - before.v) / (here.sigma - before.sigma)
 
 
@@ -123,12 +130,12 @@ def _dpmpp_2m(here: Point, then: float, past: Past) -> Array:
 
 
 def _correct(x0: Array, sigma: float, past: Past) -> Array:
-    """UniC: the state at sigma by a step from past[0] that also knows the image x0 there."""
+    """UniC: return the state at sigma after a step from past[0] that also uses the image x0 at sigma."""
     start = past[0]
     if len(past) == 1:
         return _towards(0.5 * (start.x0 + x0), start, sigma)
-    # The image's values at past[1], past[0] and sigma, weighted so that lines and parabolas in lambda come
-    # out right; equations 10 and 11 of the paper, h and r being infinite at sigma = 1.
+    # The images at past[1], past[0] and sigma are weighted so that lines and parabolas in lambda are exact:
+    # equations 10 and 11 of the paper. h and r are infinite at sigma = 1.
     h = _log_snr(sigma) - _log_snr(start.sigma)
     r = (_log_snr(past[1].sigma) - _log_snr(start.sigma)) / h
     scale = math.expm1(-h)
@@ -140,10 +147,10 @@ def _correct(x0: Array, sigma: float, past: Past) -> Array:
 
 
 def _towards(image: Array, start: Point, then: float) -> Array:
-    """Euler's step from a point, towards an image of our choice."""
+    """Return Euler's step from a point towards another image."""
     return start.x + (then - start.sigma) / start.sigma * (start.x - image)
 
 
 def _log_snr(sigma: float) -> float:
-    """lambda = log((1 - sigma) / sigma), for sigma > 0."""
+    """Return lambda = log((1 - sigma) / sigma), for sigma > 0."""
     return math.log((1 - sigma) / sigma) if sigma < 1 else -math.inf

@@ -26,7 +26,7 @@ def read(path: Path) -> Photo:
     """Read the first part; its colours come in sRGB's primaries. Raises InputError."""
     picture = read_exr_picture(path, "photo")
     light, notices = picture.pixels[..., :3], []
-    broken: NDArray[np.bool_] = np.logical_not(np.isfinite(light).all(axis=-1))
+    broken = np.asarray(~np.isfinite(light).all(axis=-1))
     if broken.any():
         notices.append(f"{int(broken.sum())} of its pixels are not finite; they are read as black.")
         light = np.where(broken[..., None], np.float32(0), light)

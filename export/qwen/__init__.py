@@ -1,11 +1,11 @@
-"""Qwen-Image-Edit with LoRAs, from diffusers' files to a bundle that runs without torch.
+"""Export Qwen-Image-Edit with LoRAs from diffusers' files to a bundle that runs without torch.
 
-weights.py      safetensors, shard by shard, tensor by tensor; LoRAs merged on the way
-lora.py         LoRA files in diffusers', peft's and Kohya's keys
-graph.py        writes one ONNX graph and its weights, in the precision asked for
-transformer.py  the graphs of the image transformer, one a block
-text.py         the graphs of the vision-language encoder, one a layer
-vae.py          the image autoencoder, as a network on single pictures
-bundle.py       the export: all of the above into one bundle, measured
-errors.py       what a precision costs, after one step and after all
+weights.py      reads safetensors one tensor at a time and merges LoRAs
+lora.py         reads LoRA files with the keys of diffusers, peft and Kohya
+graph.py        writes one ONNX graph and its weights in a precision
+transformer.py  the graphs of the image transformer, one per block
+text.py         the graphs of the vision-language encoder, one per layer
+vae.py          the image autoencoder for single pictures
+bundle.py       the export: combines all of the above into one bundle and measures it
+errors.py       measures the error of a precision after one step and after all steps
 """

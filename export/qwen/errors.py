@@ -1,4 +1,4 @@
-"""What an export costs: each block against torch, and a whole bundle against its float32 twin."""
+"""Measure the error of an export: each block against torch, and a bundle against its float32 twin."""
 
 from __future__ import annotations
 
@@ -27,49 +27,51 @@ BLOCK_BAR: Final[dict[Precision, float]] = {
     "fp16": 5e-3,
     "int8": 0.1,
     "int4": 0.5,
-}  # relative, per block
+}  # largest relative error of a block
 WORDS: Final = 5
-MEMORY: Final = 4 << 30  # of weights that stay loaded while a bundle is measured, however large it is
+MEMORY: Final = 4 << 30  # bytes of weights that stay loaded while a bundle is measured
 SIZES: Final = ((4, 6), (4, 6), (4, 6))
 
 
 def check_block(
     path: Path, config: TransformerConfig, weights: Weights, index: int, precision: Precision
 ) -> float:
-    """The error of a block's graph against diffusers' own block with the same weights, relative to the change
-    that the block makes to its inputs. Raises ExportError above what the precision may cost.
+    """Return the error of a block's graph against diffusers' block with the same weights.
+
+    The error is relative to the change that the block makes to its inputs. Raises ExportError above
+    BLOCK_BAR.
     """
     block = load_block(config, weights, index)
     feeds, inputs = block_inputs(config, block, seed=index, words=WORDS, sizes=SIZES)
     want = run_block(block, inputs)
     made = Engine(path).run(feeds)
-    given = np.concatenate([feeds["text"], feeds["image"]])
+    before = np.concatenate([feeds["text"], feeds["image"]])
     got = np.concatenate([made["text_out"], made["image_out"]])
-    error = float(np.linalg.norm(got - want) / np.linalg.norm(want - given))
+    error = float(np.linalg.norm(got - want) / np.linalg.norm(want - before))
     if not error <= BLOCK_BAR[precision]:
         raise ExportError(
-            f"Block {index} is off by {error:.2g} of what it computes; "
+            f"Block {index} differs from diffusers by {error:.2g} of what it computes; "
             f"{BLOCK_BAR[precision]:g} is allowed in {precision}."
         )
     return error
 
 
 def load_block(config: TransformerConfig, weights: Weights, index: int) -> QwenImageTransformerBlock:
-    """One of diffusers' blocks with its weights, LoRAs merged; nothing else is read."""
+    """Return one of diffusers' blocks with its weights and merged LoRAs. Nothing else is read."""
     block = empty_block(config)
     load_weights(block, f"transformer_blocks.{index}.", weights)
     return block
 
 
 def load_weights(module: torch.nn.Module, at: str, weights: Weights) -> None:
-    """Fill a module that was made without memory with the tensors whose names start with `at`."""
+    """Fill a module without memory with the tensors whose names start with `at`."""
     state = {name: torch.from_numpy(weights[at + name]) for name in module.state_dict()}
     module.load_state_dict(state, assign=True)
     module.eval()
 
 
 def empty_block(config: TransformerConfig) -> QwenImageTransformerBlock:
-    """One of diffusers' blocks that has shapes and no memory."""
+    """Return one of diffusers' blocks with shapes but no memory."""
     heads, width = config.num_attention_heads, config.attention_head_dim
     with torch.device("meta"):
         return QwenImageTransformerBlock(config.width, heads, width, zero_cond_t=config.zero_cond_t)
@@ -83,7 +85,7 @@ def block_inputs(
     words: int,
     sizes: tuple[tuple[int, int], ...],
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Random inputs of a block, for its graph and for diffusers. sizes: of the pictures, in tokens."""
+    """Return random inputs of a block, for its graph and for diffusers. sizes: of the pictures, in tokens."""
     counts = [rows * columns for rows, columns in sizes]
     random = np.random.default_rng(seed)
     image, text, embedding = (
@@ -120,14 +122,14 @@ def block_inputs(
 
 
 def run_block(block: QwenImageTransformerBlock, inputs: dict[str, Any]) -> Array:
-    """What diffusers' block makes of text and image, one below the other."""
+    """Return the output of diffusers' block: text and image, concatenated."""
     with torch.inference_mode():
         text, image = block(**inputs)
     return np.concatenate([text[0].numpy(), image[0].numpy()])
 
 
 def compare(bundle: Bundle, reference: Bundle, area: int) -> dict[str, float]:
-    """What a bundle's precision costs against its float32 twin, on one picture of `area` pixels.
+    """Return the error of a bundle against its float32 twin, on one picture of `area` pixels.
 
     one_step, all_steps: the relative error of the first guided velocity, and of the state at the end.
     picture_db: the PSNR between the two pictures.
@@ -142,7 +144,7 @@ def compare(bundle: Bundle, reference: Bundle, area: int) -> dict[str, float]:
 
 
 def _trace(bundle: Bundle, area: int) -> tuple[Array, Array, Array]:
-    """The first velocity, the last state and the picture of a run on a fixed picture and strokes."""
+    """Return the first velocity, the last state and the picture of a run with a fixed photo and strokes."""
     qwen, manifest = Qwen(bundle, "cpu", memory=MEMORY, area=area), bundle.manifest
     side = round(math.sqrt(area))
     raster = qwen.raster(side, side)
@@ -156,14 +158,14 @@ def _trace(bundle: Bundle, area: int) -> tuple[Array, Array, Array]:
 
 
 def probe_photo(size: tuple[int, int]) -> Array:
-    """A smooth picture with an edge, (h, w, 3), sRGB 0..1."""
+    """Return a smooth picture (h, w, 3) with an edge, sRGB 0..1."""
     y, x = np.mgrid[: size[0], : size[1]] / max(size)
     waves = [0.5 + 0.4 * np.sin(7 * x + 3 * y), 0.3 + 0.5 * (x > y), np.sqrt((x + y) / 2)]
     return np.stack(waves, axis=-1).clip(0, 1).astype(np.float32)
 
 
 def probe_strokes(size: tuple[int, int]) -> Strokes:
-    """A warm spot and a dark one."""
+    """Return strokes with a warm spot and a dark one."""
     y, x = np.mgrid[: size[0], : size[1]] / max(size)
     light = np.zeros((*size, 3), np.float32)
     light[np.hypot(x - 0.3, y - 0.3) < 0.1] = (1.5, 1.0, 0.6)
@@ -172,10 +174,10 @@ def probe_strokes(size: tuple[int, int]) -> Strokes:
 
 
 def relative(got: Array, want: Array) -> float:
-    """|got - want| / |want|."""
+    """Return |got - want| / |want|."""
     return float(np.linalg.norm(got - want) / np.linalg.norm(want))
 
 
 def psnr(got: Array, want: Array) -> float:
-    """Peak signal to noise, in dB, of pictures 0..1."""
+    """Return the peak signal-to-noise ratio of pictures 0..1, in dB."""
     return float(-10 * np.log10(max(np.mean(np.square(got - want, dtype=np.float64)), 1e-20)))

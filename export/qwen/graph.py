@@ -1,11 +1,12 @@
-"""Writes one ONNX graph, operation by operation, streaming its weights to a file beside it.
+"""Write one ONNX graph, operation by operation, streaming its weights to a file beside it.
 
-A graph is built by hand rather than traced so that no weight has to exist while its graph is made, and so
-that the fused operations of ONNX Runtime (attention that never holds the whole matrix of scores, rotary
-embedding, block-wise int4) and the casts of mixed precision stand where they are meant to.
+Graphs are built by hand and not traced. So no weight has to exist while its graph is built, and the fused
+operations of ONNX Runtime (attention without the full matrix of scores, rotary embedding, block-wise int4)
+and the casts of mixed precision can be placed deliberately.
 
 Activations are float32 (tokens, width) between operations, in every precision. Only `linear` and `attention`
-compute in less, and each first divides what it rounds by its largest value, so that nothing can overflow:
+compute in lower precision. Each first divides the values by the largest of them, so that nothing can
+overflow:
 
     fp32   y = x W + b
     fp16   y = s (fp16(x / s) fp16(W)) + b            s = the row's largest |x|
@@ -30,11 +31,11 @@ Precision = Literal["fp32", "fp16", "int8", "int4"]
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 OPSET = 20
 CONTRIB = "com.microsoft"
-ALIGNMENT = 4096  # the page size: weights can be mapped into memory
+ALIGNMENT = 4096  # the page size, so that weights can be mapped into memory
 INLINE_BYTES = 1024
-BLOCK = 32  # int4 weights that share one scale
-TINY = 1e-20  # stands in for the largest value of a row of zeros
-ZERO = 128  # of activations in 8 bits without a sign, the form that processors multiply fastest
+BLOCK = 32  # how many int4 weights share one scale
+TINY = 1e-20  # replaces the largest value of a row of zeros
+ZERO = 128  # zero point of unsigned 8-bit activations, which processors multiply fastest
 # Weights keep 7 of their 8 bits: x86 without VNNI adds two products in 16 bits, and 2 * 255 * 63 fits there.
 WEIGHT_LEVELS = 63
 ONNX_TYPES = {"float32": TensorProto.FLOAT, "int64": TensorProto.INT64}
@@ -43,13 +44,13 @@ Array = NDArray[Any]
 
 
 class GraphWriter:
-    """One graph in the making; values are named by the strings that its methods return.
+    """A graph under construction. Its methods return the names of values.
 
-    Use as a context manager: leaving it closes the weights' file. `finish` writes the graph.
+    Use it as a context manager, which closes the file of weights. `finish` writes the graph.
     """
 
     def __init__(self, path: Path, precision: Precision = "fp32") -> None:
-        """Weights go to `path` with the suffix .data, from the first one on."""
+        """Write weights to `path` with the suffix .data."""
         self.path, self.precision = path, precision
         self._nodes: list[onnx.NodeProto] = []
         self._weights: list[TensorProto] = []
@@ -78,17 +79,17 @@ class GraphWriter:
         self._outputs.append(Tensor(name, "float32", shape))
 
     def op(self, kind: str, *inputs: str, domain: str = "", **attributes: Any) -> str:
-        """Append an operation of one output. "" leaves an optional input out, as in ONNX."""
+        """Append an operation with one output. "" omits an optional input, as in ONNX."""
         return self.ops(kind, 1, *inputs, domain=domain, **attributes)[0]
 
     def ops(self, kind: str, outputs: int, *inputs: str, domain: str = "", **attributes: Any) -> list[str]:
-        """Append an operation of several outputs."""
+        """Append an operation with several outputs."""
         names = [self._name(kind) for _ in range(outputs)]
         self._nodes.append(helper.make_node(kind, list(inputs), names, domain=domain, **attributes))
         return names
 
     def constant(self, value: Array | np.generic) -> str:
-        """A tensor of the graph; large ones go to the file of weights."""
+        """Add a constant tensor. Large ones go to the file of weights."""
         value = np.ascontiguousarray(value)
         proto = TensorProto(
             name=self._name("constant"),
@@ -109,7 +110,7 @@ class GraphWriter:
         return self.constant(np.array(values, np.int64))
 
     def finish(self, name: str) -> Graph:
-        """Write the graph; return its description with the file's bare name."""
+        """Write the graph. Return its description, with the file name alone."""
         graph = helper.make_graph(
             self._nodes,
             name,
@@ -125,7 +126,8 @@ class GraphWriter:
         return Graph(self.path.name, tuple(self._inputs), tuple(self._outputs))
 
     def linear(self, x: str, weight: Array, bias: Array | None, precision: Precision | None = None) -> str:
-        """y = x W^T + b for x (rows, in) and a float32 weight (out, in); precision None is the graph's."""
+        """Append y = x W^T + b for x (rows, in) and a float32 weight (out, in). precision: None is the
+        graph's."""
         precision = precision or self.precision
         if precision == "fp32":
             inputs = [x, self.constant(weight), *([] if bias is None else [self.constant(bias)])]
@@ -136,25 +138,24 @@ class GraphWriter:
         return y if bias is None else self.op("Add", y, self.constant(bias))
 
     def layer_norm(self, x: str, width: int, eps: float) -> str:
-        """(x - mean) / sqrt(variance + eps) over the last axis, without scale and shift."""
+        """Append (x - mean) / sqrt(variance + eps) over the last axis, without scale and shift."""
         return self.op("LayerNormalization", x, self.constant(np.ones(width, np.float32)), epsilon=eps)
 
     def rms_norm(self, x: str, scale: Array, eps: float) -> str:
-        """x / sqrt(mean(x^2) + eps) * scale over the last axis."""
+        """Append x / sqrt(mean(x^2) + eps) * scale over the last axis."""
         mean = self.op("ReduceMean", self.op("Mul", x, x), self.ints(-1), keepdims=1)
         root = self.op("Sqrt", self.op("Add", mean, self.scalar(eps)))
         return self.op("Mul", self.op("Div", x, root), self.constant(scale))
 
     def head_norm(self, x: str, heads: int, scale: Array, eps: float) -> str:
-        """`rms_norm` of each head of x (tokens, heads * head width) by itself."""
+        """Append `rms_norm` of each head of x (tokens, heads * head width)."""
         split = self.op("Reshape", x, self.ints(0, heads, -1))
         return self.op("Reshape", self.rms_norm(split, scale, eps), self.ints(0, -1))
 
     def rotate(self, x: str, cos: str, sin: str, *, interleaved: bool) -> str:
-        """Rotary embedding of every head of x (tokens, width) by the angles of (tokens, head width / 2).
+        """Append the rotary embedding of every head of x (tokens, width) by angles (tokens, head width / 2).
 
-        interleaved: the pairs that turn are neighbours (0, 1), (2, 3) ..., else the halves (0, d/2), (1, d/2
-        + 1) ...
+        interleaved: rotate the neighbours (0, 1), (2, 3) ..., instead of (0, d/2), (1, d/2 + 1) ...
         """
         rows = self.op("Unsqueeze", x, self.ints(0))
         turned = self.op(
@@ -163,7 +164,7 @@ class GraphWriter:
         return self.op("Squeeze", turned, self.ints(0))
 
     def attention(self, q: str, k: str, v: str, heads: int, *, bias: str = "", causal: bool = False) -> str:
-        """softmax(q k^T / sqrt(head width) + bias) v, head by head, for (tokens, heads * head width) each.
+        """Append softmax(q k^T / sqrt(head width) + bias) v per head; all are (tokens, heads * head width).
 
         bias: (1, 1, tokens, tokens), or "" for none.
         """
@@ -222,7 +223,7 @@ class GraphWriter:
         )
 
     def _by_largest(self, x: str) -> tuple[str, str]:
-        """x with every row divided by its largest |value|, and those values (rows, 1)."""
+        """Append x with every row divided by its largest |value|. Also returns those values (rows, 1)."""
         largest = self.op("ReduceMax", self.op("Abs", x), self.ints(-1), keepdims=1)
         scale = self.op("Max", largest, self.scalar(TINY))
         return self.op("Div", x, scale), scale
@@ -243,11 +244,11 @@ class GraphWriter:
 
 
 def quantize_int4(weight: Array) -> tuple[Array, Array]:
-    """Symmetric int4 by blocks of 32 inputs, as MatMulNBits stores it.
+    """Quantise to symmetric int4 in blocks of 32 inputs, in the layout of MatMulNBits.
 
-    weight: float32 (out, in). Returns uint8 (out, blocks, 16) of two values a byte, the lower half first,
-    each 8 above what it stands for, and float32 scales (out * blocks,). The value of largest magnitude in a
-    block is exact.
+    weight: float32 (out, in). Returns uint8 (out, blocks, 16) with two values per byte, the lower half first,
+    each with an offset of 8, and float32 scales (out * blocks,). The value of largest magnitude in a block is
+    exact.
     """
     rows, columns = weight.shape
     blocks = -(-columns // BLOCK)

@@ -1,10 +1,10 @@
-"""LoRA files: which layers they change, and by how much.
+"""Read LoRA files: which layers they change, and by how much.
 
-One file may name a layer in diffusers' way (transformer.<layer>.lora_A.weight), peft's
-(base_model.model.<layer>.lora_A.default.weight), ComfyUI's (diffusion_model.<layer>.lora_down.weight) or
-Kohya's (lora_unet_<layer with _ for .>.lora_down.weight). The change is strength * alpha / rank * B A: the
-rank is read from the matrices, alpha from the file's own tensors, its metadata, or peft's adapter_config.json
-beside it; without any, alpha is the rank.
+A file may name a layer as diffusers does (transformer.<layer>.lora_A.weight), as peft does
+(base_model.model.<layer>.lora_A.default.weight), as ComfyUI does (diffusion_model.<layer>.lora_down.weight)
+or as Kohya does (lora_unet_<layer with _ for .>.lora_down.weight). The change is strength * alpha / rank *
+B A: the rank is read from the matrices, alpha from the file's own tensors, its metadata, or peft's
+adapter_config.json beside it; without any, alpha is the rank.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class _Change:
 
 
 class Lora:
-    """One LoRA file and the strength it is merged with."""
+    """A LoRA file and the strength with which it is merged."""
 
     def __init__(self, path: Path, strength: float = 1.0) -> None:
-        """Raises InputError for a file that is missing, cut short, or no LoRA."""
+        """Open the file. Raises InputError if it is missing, cut short, or no LoRA."""
         if not math.isfinite(strength):
             raise InputError(f"The LoRA {path.name} cannot be merged with a strength of {strength}.")
         self.path, self.strength = path, strength
@@ -58,14 +58,14 @@ class Lora:
             self._sort(key)
         for layer, change in self._changes.items():
             if not (change.down and change.up):
-                raise InputError(f"The LoRA {path} has only half of its change to {layer!r}.")
+                raise InputError(f"The LoRA {path} has only one of the two matrices for {layer!r}.")
         if not self._changes:
             raise InputError(f"{path} holds no LoRA.")
 
     def targets(self, names: Iterable[str]) -> list[str]:
-        """Those of the model's tensors that the file changes; Kohya's layer names become the model's own.
+        """Return the model's tensors that the file changes, with Kohya's layer names translated.
 
-        Raises InputError where the file changes what the model does not have.
+        Raises InputError if the file changes layers that the model does not have.
         """
         layers = {name.removesuffix(".weight"): name for name in names if name.endswith(".weight")}
         flat = {KOHYA + layer.replace(".", "_"): layer for layer in layers}
@@ -79,7 +79,7 @@ class Lora:
         return [layers[layer] for layer in self._changes]
 
     def check(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        """InputError unless every change fits the (out, in) of the layer that it is for."""
+        """Raise InputError unless every change has the shape (out, in) of its layer."""
         with safe_open(self.path, framework="pt") as file:
             for layer, change in self._changes.items():
                 down, up = (tuple(file.get_slice(key).get_shape()) for key in (change.down, change.up))
@@ -90,7 +90,7 @@ class Lora:
                     )
 
     def delta(self, layer: str) -> NDArray[np.float32] | None:
-        """What is added to the layer's (out, in) weight, or None."""
+        """Return the change of the layer's (out, in) weight, or None."""
         change = self._changes.get(layer)
         if change is None:
             return None
@@ -120,7 +120,7 @@ class Lora:
 
 @dataclass(frozen=True)
 class _Adapter:
-    """What peft says of the scale where the file's tensors do not."""
+    """The scale in peft's settings, used if the file's tensors do not contain it."""
 
     default: float | None = None
     patterns: Mapping[str, float] | None = None

@@ -1,11 +1,11 @@
-"""Modulation: what the transformer's blocks are told of sigma, a third of the model's weights.
+"""Modulation: how sigma enters the transformer's blocks; a third of the model's weights.
 
     time        sigma (R,)     -> embedding (R, D)    SiLU(MLP(sinusoids of 1000 sigma))
     block.NN    embedding      -> rows (R, 12, D)     image, then text: shift, scale, gate, twice
     head        embedding      -> rows (R, 2, D)      scale, shift
 
-None of it depends on the picture, so a bundle for one schedule carries the rows in a table (R, 12 layers + 2,
-D) and not these graphs. All of it is float32 in every precision.
+None of it depends on the picture. So a bundle for one schedule holds the rows in a table (R, 12 layers + 2,
+D) in place of these graphs. Everything is float32 in every precision.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from dior_rt.export.qwen.graph import GraphWriter
 from dior_rt.export.qwen.transformer import TransformerConfig
 from dior_rt.export.qwen.weights import Array, Weights
 
-WAVES = 256  # half cosines, half sines
+WAVES = 256  # one half cosines, the other half sines
 PERIOD = 10000.0
 
 
 def write_modulation(
     folder: Path, config: TransformerConfig, weights: Weights
 ) -> Iterator[tuple[str, Graph]]:
-    """Write the graphs into `folder`, yielding each as it is done."""
+    """Write the graphs into `folder`, yielding each when it is written."""
     yield "time", write_time(folder / "time.onnx", config, weights)
     for index in range(config.num_layers):
         name = f"block.{index:02}"
@@ -55,7 +55,7 @@ def write_time(path: Path, config: TransformerConfig, weights: Weights) -> Graph
 def write_rows(
     path: Path, config: TransformerConfig, weights: Weights, layers: Iterable[str], each: int
 ) -> Graph:
-    """Linear layers of the embedding, `each` vectors from every one."""
+    """Append linear layers of the embedding, with `each` vectors per layer."""
     with GraphWriter(path) as g:
         embedding = g.input("embedding", "rows", config.width)
         made = [g.linear(embedding, weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in layers]
@@ -67,9 +67,9 @@ def write_rows(
 def tabulate(
     path: Path, sigmas: Array, folder: Path, written: Iterable[tuple[str, Graph]], config: TransformerConfig
 ) -> None:
-    """Write the table of the sigmas' rows, running each graph as soon as it is written, then deleting it."""
+    """Write the table of rows for the sigmas. Each graph is written, run, and deleted."""
     shape = (len(sigmas), 12 * config.num_layers + 2, config.width)
-    table = np.empty(shape, np.float32)  # in memory: a mapped file on a full disk ends the process
+    table = np.empty(shape, np.float32)  # a mapped file on a full disk would end the process
     embedding, start = sigmas, 0
     for name, graph in written:
         engine = Engine(folder / graph.file)

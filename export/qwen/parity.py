@@ -1,7 +1,8 @@
-"""Parity of the autoencoder and of the text encoder's layers with diffusers and transformers.
+"""Compare the autoencoder and the text encoder's layers with diffusers and transformers.
 
-Each part is built by its own library with the same weights, and nothing else is in memory meanwhile. Over a
-bar the export fails; the figures go into the manifest. The transformer's blocks: see `errors.check_block`.
+Each part is built by its own library with the same weights, while nothing else is in memory. The export fails
+above a bar; the figures go into the manifest. `errors.check_block` does the same for the transformer's
+blocks.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from dior_rt.flow.sampler import Array
 VAE_BAR: Final = 1e-4  # largest error, relative to the largest value
 PICTURE: Final = (64, 96)
 WORDS: Final = 7
-PATCHES: Final = (8, 12)  # of two windows
+PATCHES: Final = (8, 12)  # the size of two windows
 
 
 def check_vae(folder: Path, config: Path, weights: Checkpoint) -> dict[str, float]:
-    """The errors of encoder.onnx and decoder.onnx in `folder`, relative to the largest value.
+    """Return the errors of encoder.onnx and decoder.onnx in `folder`, relative to the largest value.
 
     config: the autoencoder's config.json. Raises ExportError above VAE_BAR.
     """
@@ -63,9 +64,9 @@ def check_vae(folder: Path, config: Path, weights: Checkpoint) -> dict[str, floa
 def check_text_layer(
     path: Path, config: TextConfig, weights: Weights, name: str, precision: Precision
 ) -> float | None:
-    """The error of the graph text.block.NN or vision.block.NN at `path`, relative to what the layer changes.
+    """Return the error of the graph text.block.NN or vision.block.NN, relative to what the layer changes.
 
-    None for the other graphs of the encoder. Raises ExportError above what the precision may cost.
+    Return None for the other graphs of the encoder. Raises ExportError above BLOCK_BAR.
     """
     kind, _, index = name.rpartition(".")
     if kind == "text.block":
@@ -78,8 +79,8 @@ def check_text_layer(
     error = float(np.linalg.norm(got - want) / np.linalg.norm(want - feeds["x"]))
     if not error <= BLOCK_BAR[precision]:
         raise ExportError(
-            f"The layer {name} of the text encoder is off by {error:.2g} of what it computes; "
-            f"{BLOCK_BAR[precision]:g} is allowed in {precision}."
+            f"The layer {name} of the text encoder differs from transformers by {error:.2g} of what it "
+            f"computes; {BLOCK_BAR[precision]:g} is allowed in {precision}."
         )
     return error
 
@@ -110,7 +111,7 @@ def _vision_block(config: TextConfig, weights: Weights, index: int) -> tuple[Fee
 
 
 def _inputs(rows: int, width: int, head: int, seed: int) -> tuple[dict[str, Array], tuple[torch.Tensor, ...]]:
-    """Random x and rotary positions, as the graph takes them and as transformers does."""
+    """Return random x and rotary positions, for the graph and for transformers."""
     random = np.random.default_rng(seed)
     x = random.standard_normal((rows, width), dtype=np.float32)
     angles = random.uniform(0, 6, (rows, head // 2)).astype(np.float32)
@@ -119,7 +120,7 @@ def _inputs(rows: int, width: int, head: int, seed: int) -> tuple[dict[str, Arra
 
 
 def _plain_attention(config: Any) -> Any:
-    """The same settings, computed without fused kernels."""
+    """Return the same settings, but without fused kernels."""
     plain = copy(config)
     plain._attn_implementation = "eager"
     return plain

@@ -1,4 +1,4 @@
-"""A diffusers folder of Qwen-Image-Edit: which files hold what, read as far as the export needs it."""
+"""Read a diffusers folder of Qwen-Image-Edit, as far as the export needs it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MULTIPLE: Final = 32
 
 @dataclass(frozen=True)
 class Files:
-    """Safetensors files of whole parts, as they are also handed on, in place of those in the folder."""
+    """Safetensors files with all weights of a part, used in place of those in the folder."""
 
     transformer: Path | None = None
     vae: Path | None = None
@@ -37,10 +37,10 @@ IN_FOLDER: Final = Files()
 
 
 class Sources:
-    """The parts of a model on disk: a diffusers folder, of whose parts the weights may lie elsewhere."""
+    """The parts of a model: a diffusers folder, and optionally weights in other files."""
 
     def __init__(self, folder: Path, loras: Sequence[Lora] = (), files: Files = IN_FOLDER) -> None:
-        """Raises InputError for a folder that is no such model, and for LoRAs that do not fit it."""
+        """Open the folder. Raises InputError if it is no such model, or if a LoRA does not fit it."""
         if not folder.is_dir():
             raise InputError(f"There is no model folder at {folder}.")
         self.folder = folder
@@ -61,7 +61,7 @@ class Sources:
         return Checkpoint(self._text_file)
 
     def schedule(self) -> ShiftSchedule | DynamicShiftSchedule:
-        """The scheduler's; InputError where it is none that the runtime has."""
+        """Return the schedule. Raises InputError if the runtime does not have it."""
         path = self.folder / "scheduler" / "scheduler_config.json"
         found = read_config(path)
         strange = [f"use_{kind}_sigmas" for kind in ("karras", "exponential", "beta")] + ["invert_sigmas"]
@@ -69,14 +69,14 @@ class Sources:
             any(found.get(name) for name in strange)
             or found.get("time_shift_type", "exponential") != "exponential"
         ):
-            raise InputError(f"{path} asks for a schedule that this export does not know.")
+            raise InputError(f"{path} uses a schedule that this export does not support.")
         try:
             return _schedule(found)
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path} describes no schedule that this export knows: {error}.") from error
+            raise InputError(f"{path} describes no schedule that this export supports: {error}.") from error
 
     def text_settings(self, prompts: dict[str, tuple[int, ...]], vision_area: int) -> TextSettings:
-        """What the runtime has to know to run the text encoder on these prompts."""
+        """Return the settings that the runtime needs to run the text encoder on these prompts."""
         text, vision = self.text.text, self.text.vision
         seen = read_config(self.folder / "processor" / "preprocessor_config.json")
         limits: Any = seen.get("size", {})
@@ -122,9 +122,9 @@ class Sources:
         return int(word)
 
     def word_ids(self, prompt: str, pictures: int) -> tuple[int, ...]:
-        """A prompt that speaks of so many pictures, in its template, as ids."""
-        said = "".join(PICTURE.format(k + 1) for k in range(pictures)) + prompt
-        ids = tuple(self._tokenizer(TEMPLATE.format(said))["input_ids"])
+        """Return the word ids of a prompt in its template, with room for that many pictures."""
+        words = "".join(PICTURE.format(k + 1) for k in range(pictures)) + prompt
+        ids = tuple(self._tokenizer(TEMPLATE.format(words))["input_ids"])
         if ids.count(self._picture_id()) != pictures:
             raise InputError(f"The tokenizer of {self.folder} does not know the word for a picture.")
         return ids

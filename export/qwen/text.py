@@ -1,4 +1,4 @@
-"""The graphs of Qwen2.5-VL, as the encoder of a prompt and its pictures, one graph a layer.
+"""Write the graphs of Qwen2.5-VL, which encodes a prompt and its pictures: one graph per layer.
 
     vision.embed       patches (P, 1176)                     -> x (P, V)
     vision.block.NN    x, cos, sin (P, d/2), groups (P,)     -> x           attention within equal groups
@@ -6,8 +6,8 @@
     text.block.NN      x (T, D), cos, sin (T, d/2)           -> x           causal, grouped keys
     text.norm          x                                     -> x
 
-The patches come in the order of the vision windows; the runtime sorts them, and looks up the few rows of the
-embedding that the fixed prompts need, so that the table of all words stays behind.
+The runtime sorts the patches into the order of the vision windows. It looks up the few embeddings that the
+fixed prompts need, so the bundle does not contain the table of all words.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from dior_rt.errors import InputError
 from dior_rt.export.qwen.graph import GraphWriter, Precision
 from dior_rt.export.qwen.weights import Checkpoint
 
-VISION_EPS = 1e-6  # as in the model's code; its config has none
-OUT_OF_GROUP = -1e9  # added to a score, leaves nothing of it
+VISION_EPS = 1e-6  # from the model's code; its config does not contain it
+OUT_OF_GROUP = -1e9  # added to a score, removes it
 
 
 @dataclass(frozen=True)
 class TextConfig:
-    """What text_encoder/config.json says of the language model and of the vision tower."""
+    """The settings of the language model and the vision tower in text_encoder/config.json."""
 
     text: Any
     vision: Any
 
     @classmethod
     def read(cls, folder: Path) -> TextConfig:
-        """Raises InputError where the folder describes no Qwen2.5-VL."""
+        """Read the settings. Raises InputError if the folder describes no Qwen2.5-VL."""
         try:
             config: Any = Qwen2_5_VLConfig.from_pretrained(folder, local_files_only=True)
         except (OSError, ValueError, TypeError) as error:
@@ -48,14 +48,14 @@ class TextConfig:
             or text.hidden_act != "silu"
             or vision.hidden_act != "silu"
         ):
-            raise InputError(f"{folder} asks for a kind of layer that this export does not know.")
+            raise InputError(f"{folder} uses a kind of layer that this export does not support.")
         return cls(text, vision)
 
 
 def write_text_encoder(
     folder: Path, config: TextConfig, weights: Checkpoint, precision: Precision
 ) -> Iterator[tuple[str, Graph]]:
-    """Write every graph into `folder`, yielding each as it is done."""
+    """Write every graph into `folder`, yielding each when it is written."""
     yield "vision.embed", _write_vision_embed(folder / "vision.embed.onnx", config, weights)
     for index in range(config.vision.depth):
         name = f"vision.block.{index:02}"
@@ -139,21 +139,21 @@ def _write_text_norm(path: Path, config: TextConfig, weights: Checkpoint) -> Gra
 
 
 def _gated(g: GraphWriter, x: str, weights: Checkpoint, at: str, bias: bool = True) -> str:
-    """W_down (SiLU(W_gate x) * W_up x)."""
+    """Append W_down (SiLU(W_gate x) * W_up x)."""
     gate, up = (_linear(g, x, weights, f"{at}{name}_proj", bias) for name in ("gate", "up"))
     gate = g.op("Mul", gate, g.op("Sigmoid", gate))
     return _linear(g, g.op("Mul", gate, up), weights, f"{at}down_proj", bias)
 
 
 def _same_group(g: GraphWriter, groups: str) -> str:
-    """The bias (1, 1, P, P) that lets a patch see those of its own group alone."""
+    """Append the bias (1, 1, P, P) that restricts attention to patches of the same group."""
     same = g.op("Equal", g.op("Unsqueeze", groups, g.ints(1)), g.op("Unsqueeze", groups, g.ints(0)))
     bias = g.op("Where", same, g.scalar(0), g.scalar(OUT_OF_GROUP))
     return g.op("Unsqueeze", bias, g.ints(0, 1))
 
 
 def _repeat(g: GraphWriter, x: str, groups: int, times: int) -> str:
-    """Each of the heads of (tokens, groups * head) `times` times, one after another."""
+    """Append (tokens, groups * head) with each head repeated `times` times."""
     split = g.op("Unsqueeze", g.op("Reshape", x, g.ints(0, groups, -1)), g.ints(2))
     return g.op("Reshape", g.op("Expand", split, g.ints(1, 1, times, 1)), g.ints(0, -1))
 

@@ -1,12 +1,12 @@
-"""The graphs of QwenImageTransformer2DModel, taken apart so that no two blocks need be in memory at once.
+"""Write the graphs of QwenImageTransformer2DModel, one per block, so that only one has to be in memory.
 
     embed       latents (I, C), text (T, J)                           -> image (I, D), text (T, D)
     block.NN    image, text, cos, sin (T + I, d/2), modulation         -> image, text
     head        image, modulation (2, D)                              -> velocity (I, C')
 
-D = heads * d. What the blocks are told of sigma, 12 vectors each (shift, scale and gate, twice, of the image
-and of the text), is their modulation. It depends on nothing else, so it is no part of these graphs: see
-modulation.py.
+D = heads * d. The modulation of a block is 12 vectors: shift, scale and gate, twice, for the image and for
+the text.
+It depends on sigma alone, so it is not part of these graphs: see modulation.py.
 
 With zero_cond_t (the 2511 model) the tokens of the reference pictures take the modulation of sigma = 0;
 `lengths` holds how many tokens are being denoised, and how many follow them as references.
@@ -24,12 +24,12 @@ from dior_rt.export.qwen.graph import GraphWriter, Precision
 from dior_rt.export.qwen.weights import Weights, read_config
 
 EPS = 1e-6
-THETA = 10000.0  # of the rotary positions; its config has none
+THETA = 10000.0  # base of the rotary positions; the config does not contain it
 
 
 @dataclass(frozen=True)
 class TransformerConfig:
-    """What transformer/config.json says; names as there."""
+    """The settings in transformer/config.json, with the names used there."""
 
     in_channels: int
     out_channels: int
@@ -47,19 +47,19 @@ class TransformerConfig:
 
     @classmethod
     def read(cls, path: Path) -> TransformerConfig:
-        """Raises InputError for a model that this export does not know."""
+        """Read the settings. Raises InputError for a model that this export does not support."""
         found = read_config(path)
         for name in ("guidance_embeds", "use_additional_t_cond", "use_layer3d_rope"):
             if found.get(name):
-                raise InputError(f"{path} asks for {name}, which is another model than Qwen-Image-Edit.")
+                raise InputError(f"{path} sets {name}, so it is not Qwen-Image-Edit.")
         try:
-            known = {
+            fields = {
                 name: found[name]
                 for name in cls.__dataclass_fields__
                 if name not in ("zero_cond_t", "patch_size")
             }
-            known["axes_dims_rope"] = tuple(known["axes_dims_rope"])
-            return cls(zero_cond_t=bool(found.get("zero_cond_t", False)), **known)
+            fields["axes_dims_rope"] = tuple(fields["axes_dims_rope"])
+            return cls(zero_cond_t=bool(found.get("zero_cond_t", False)), **fields)
         except (KeyError, TypeError) as error:
             raise InputError(
                 f"{path} describes no QwenImageTransformer2DModel: {error} is missing."
@@ -69,7 +69,7 @@ class TransformerConfig:
 def write_transformer(
     folder: Path, config: TransformerConfig, weights: Weights, precision: Precision
 ) -> Iterator[tuple[str, Graph]]:
-    """Write embed, blocks and head into `folder`, yielding each as it is done. Embed and head stay fp32."""
+    """Write embed, blocks and head into `folder`, yielding each when written. Embed and head stay fp32."""
     yield "embed", write_embed(folder / "embed.onnx", config, weights)
     for index in range(config.num_layers):
         name = f"block.{index:02}"
@@ -100,7 +100,7 @@ def write_head(path: Path, config: TransformerConfig, weights: Weights) -> Graph
 def write_block(
     path: Path, config: TransformerConfig, weights: Weights, index: int, precision: Precision
 ) -> Graph:
-    """One QwenImageTransformerBlock with its QwenDoubleStreamAttnProcessor2_0, in real numbers."""
+    """Write one QwenImageTransformerBlock with QwenDoubleStreamAttnProcessor2_0, in real numbers."""
     width, at = config.width, f"transformer_blocks.{index}."
     with GraphWriter(path, precision) as g:
         image = g.input("image", "image_tokens", width)
@@ -134,7 +134,7 @@ def _attend(
     cos: str,
     sin: str,
 ) -> dict[str, str]:
-    """Joint attention of the text and image tokens, in that order; what it adds to each of the two."""
+    """Append joint attention of text and image tokens, in that order. Return what it adds to each."""
     heads = config.num_attention_heads
     layers = {"txt": ("add_{}_proj", "norm_added_{}", "to_add_out"), "img": ("to_{}", "norm_{}", "to_out.0")}
 
@@ -158,14 +158,14 @@ def _attend(
 
 
 class Modulation:
-    """Shift, scale and gate for a block's two halves, from tables (6, D): one, or one for each part of x."""
+    """Shift, scale and gate of a block's two halves, from tables (6, D): one, or one for each part of x."""
 
     def __init__(self, g: GraphWriter, tables: list[str], lengths: str = "") -> None:
         self._g, self._lengths = g, lengths
         self._rows = [g.ops("Split", 6, table, axis=0, num_outputs=6) for table in tables]
 
     def norm(self, x: str, half: int, width: int) -> str:
-        """LayerNorm(x) (1 + scale) + shift."""
+        """Append LayerNorm(x) (1 + scale) + shift."""
         return self._each(
             x, lambda part, rows: modulated(self._g, part, rows[3 * half + 1], rows[3 * half], width)
         )
@@ -182,7 +182,7 @@ class Modulation:
 
 
 def modulated(g: GraphWriter, x: str, scale: str, shift: str, width: int) -> str:
-    """LayerNorm(x) (1 + scale) + shift, for one scale and one shift."""
+    """Append LayerNorm(x) (1 + scale) + shift, for one scale and one shift."""
     grown = g.op("Mul", g.layer_norm(x, width, EPS), g.op("Add", scale, g.scalar(1)))
     return g.op("Add", grown, shift)
 

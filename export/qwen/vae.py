@@ -1,12 +1,12 @@
-"""The graphs of AutoencoderKLQwenImage, a video autoencoder, as the network that it is on a single picture.
+"""Write the graphs of AutoencoderKLQwenImage, a video autoencoder, for single pictures.
 
     encoder    pixels (1, 3, 8 h, 8 w) in -1..1    -> latents (1, z, h, w): the posterior's mean, normalised
     decoder    latents (1, z, h, w), normalised    -> pixels (1, 3, 8 h, 8 w), clipped to -1..1
 
-Its convolutions run over time too, causally: a picture's past is zeros, so only the last of the three slices
-of each kernel meets anything else. Keeping that slice turns every 3-D convolution into a 2-D one, a third of
-the work and of the weights, and the result is the same. The layers that change the frame rate do nothing to
-the first frame.
+Its convolutions also run over time, causally. The past of a picture is zeros, so only the last of the three
+slices of each kernel meets non-zero values. Keeping that slice alone turns every 3-D convolution into a 2-D
+one, with a third of the work and of the weights and the same result. The layers that change the frame rate
+do not change the first frame.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dior_rt.export.qwen.weights import Checkpoint, read_config
 
 @dataclass(frozen=True)
 class VaeConfig:
-    """What vae/config.json says; names as there."""
+    """The settings in vae/config.json, with the names used there."""
 
     z_dim: int
     temperal_downsample: tuple[bool, ...]
@@ -35,12 +35,12 @@ class VaeConfig:
 
     @property
     def factor(self) -> int:
-        """Pixels a latent, each way."""
+        """Return the pixels per latent in each direction."""
         return int(2 ** len(self.temperal_downsample))
 
     @classmethod
     def read(cls, path: Path) -> VaeConfig:
-        """Raises InputError where the file describes no such autoencoder."""
+        """Read the settings. Raises InputError if the file describes no such autoencoder."""
         found = read_config(path)
         try:
             return cls(
@@ -52,7 +52,7 @@ class VaeConfig:
 
 
 def vae_names(keys: Iterable[str]) -> dict[str, str]:
-    """The keys of an autoencoder's file -> diffusers' names; those of Wan, its origin, differ."""
+    """Return the keys of an autoencoder's file -> diffusers' names. The keys of Wan, its origin, differ."""
     return {key: name for name, key in convert_wan_vae_to_diffusers({key: key for key in keys}).items()}
 
 
@@ -85,13 +85,13 @@ def write_decoder(path: Path, config: VaeConfig, weights: Checkpoint) -> Graph:
 
 
 class _Net:
-    """The layers, each by the name that its weights have in the checkpoint; x is (1, channels, h, w)."""
+    """The layers, by the names of their weights in the checkpoint. x is (1, channels, h, w)."""
 
     def __init__(self, g: GraphWriter, weights: Checkpoint) -> None:
         self.g, self.weights = g, weights
 
     def children(self, at: str) -> list[str]:
-        """The numbered parts of `at`, in order."""
+        """Return the numbered parts of `at`, in order."""
         numbers = {
             name[len(at) + 1 :].partition(".")[0] for name in self.weights.names if name.startswith(f"{at}.")
         }
@@ -124,7 +124,7 @@ class _Net:
         return self.g.op("Add", path, skip)
 
     def attention(self, x: str, at: str) -> str:
-        """Self-attention of one head over all pixels."""
+        """Append self-attention with one head over all pixels."""
         g, channels = self.g, self.weights.shape(f"{at}.proj.weight")[0]
         qkv = g.op("Reshape", self.conv(self.norm(x, f"{at}.norm"), f"{at}.to_qkv"), g.ints(3 * channels, -1))
         q, k, v = g.ops("Split", 3, g.op("Transpose", qkv, perm=[1, 0]), axis=1, num_outputs=3)
@@ -133,7 +133,7 @@ class _Net:
         return g.op("Add", x, self.conv(mixed, f"{at}.proj"))
 
     def norm(self, x: str, at: str) -> str:
-        """x / |x| sqrt(channels) gamma over the channels."""
+        """Append x / |x| sqrt(channels) gamma over the channels."""
         g, gamma = self.g, self.weights[f"{at}.gamma"].reshape(-1, 1, 1)
         length = g.op("Max", g.op("ReduceL2", x, g.ints(1), keepdims=1), g.scalar(1e-12))
         return g.op("Mul", g.op("Div", x, length), g.constant(gamma * np.float32(len(gamma) ** 0.5)))
@@ -142,7 +142,7 @@ class _Net:
         return self.g.op("Mul", x, self.g.op("Sigmoid", x))
 
     def double(self, x: str) -> str:
-        """Each pixel twice, both ways."""
+        """Append x with each pixel doubled in both directions."""
         scales = self.g.constant(np.array([1, 1, 2, 2], np.float32))
         return self.g.op(
             "Resize",
@@ -155,7 +155,8 @@ class _Net:
         )
 
     def conv(self, x: str, at: str, stride: int = 1) -> str:
-        """A convolution that keeps the size or, with a stride of 2 and padding at the far edges, halves."""
+        """Append a convolution that keeps the size, or halves it by a stride of 2 with padding at the far
+        edges."""
         weight = self.weights[f"{at}.weight"]
         if weight.ndim == 5:
             weight = weight[:, :, -1]

@@ -1,4 +1,4 @@
-"""Weights on disk, read one tensor at a time: memory holds what is being converted, never a whole model."""
+"""Read weights one tensor at a time, so that memory never holds a whole model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dior_rt.export.qwen.lora import Lora
 Array = NDArray[np.float32]
 
 INDEX = ".safetensors.index.json"
-# What checkpoints of one file, and newer transformers, put where diffusers' folders have the right-hand side.
+# Prefixes in single-file checkpoints and newer versions of transformers -> those in diffusers' folders.
 RENAMED = (
     ("model.diffusion_model.", ""),
     ("diffusion_model.", ""),
@@ -37,7 +37,7 @@ class Weights(Protocol):
 
 
 def plain_names(keys: Iterable[str]) -> dict[str, str]:
-    """Keys -> names as in diffusers' folders."""
+    """Return keys -> names as in diffusers' folders."""
     return {key: _plain(key) for key in keys}
 
 
@@ -45,9 +45,9 @@ class Checkpoint:
     """The tensors of a safetensors file, or of a folder of them with diffusers' or transformers' index."""
 
     def __init__(self, path: Path, names: Callable[[Iterable[str]], dict[str, str]] = plain_names) -> None:
-        """names: the files' keys -> the tensors' names.
+        """Open the checkpoint. names: the files' keys -> the tensors' names.
 
-        Raises InputError where there are no weights at `path`, or shards are missing or cut short.
+        Raises InputError if there are no weights at `path`, or if shards are missing or cut short.
         """
         self.path = path
         self._places = {
@@ -67,7 +67,7 @@ class Checkpoint:
         return self._read(name, lambda tensors, key: tensors.get_tensor(key))
 
     def rows(self, name: str, indices: Sequence[int]) -> Array:
-        """These rows of a tensor, read without the others."""
+        """Read some rows of a tensor."""
         return self._read(
             name, lambda tensors, key: torch.stack([tensors.get_slice(key)[i] for i in indices])
         )
@@ -84,7 +84,7 @@ class Checkpoint:
                 f"{file} stores {key!r} as {tensor.dtype}; export needs float32, float16 or bfloat16."
             )
         if not torch.isfinite(tensor).all():
-            raise InputError(f"{file} is damaged: {key!r} holds values that are not finite.")
+            raise InputError(f"{file} is damaged: {key!r} contains values that are not finite.")
         return tensor.float().numpy()
 
     def _place(self, name: str) -> tuple[Path, str]:
@@ -96,9 +96,9 @@ class Checkpoint:
 
 
 class Merged:
-    """A checkpoint with LoRAs added: W + sum of strength * alpha / rank * B A, tensor by tensor.
+    """A checkpoint with merged LoRAs: W + sum of strength * alpha / rank * B A, tensor by tensor.
 
-    Raises InputError for a LoRA that speaks of layers the checkpoint does not have, or of another width.
+    Raises InputError for a LoRA of layers that the checkpoint does not have, or of another width.
     """
 
     def __init__(self, base: Checkpoint, loras: Sequence[Lora]) -> None:
@@ -119,7 +119,7 @@ class Merged:
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """A JSON object from disk; InputError where there is none."""
+    """Read a JSON object from a file. Raises InputError if there is none."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dior_rt.bundle import Bundle
-from dior_rt.export.mini import Recipe, export_network
+from dior_rt.export.mini import MiniExportConfig, export_network
 from dior_rt.grid import GridRule
 from dior_rt.training.network import Config, Mini
 
@@ -26,8 +26,8 @@ def network() -> Mini:
 
 
 @pytest.fixture(scope="session")
-def recipe() -> Recipe:
-    return Recipe(name="small", grid=GridRule(1024, 4, 256), steps=4, guidance=2.0)
+def recipe() -> MiniExportConfig:
+    return MiniExportConfig(name="small", grid=GridRule(1024, 4, 256), steps=4, guidance=2.0)
 
 
 @pytest.fixture(scope="session")

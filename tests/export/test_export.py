@@ -163,7 +163,7 @@ def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
     torch.manual_seed(1)
     adapted = get_peft_model(network, LoraConfig(r=2, target_modules=["qkv"], init_lora_weights=False))
     adapted.save_pretrained(tmp_path / "lora")
-    bundle = export_checkpoint(tmp_path, tmp_path / "b", recipe=recipe, weights="fp32")
+    bundle = export_checkpoint(tmp_path, tmp_path / "b", config=recipe, weights="fp32")
     assert bundle.manifest.precision == "fp32" and "weights_as_fp16" not in bundle.manifest.parity
     assert bundle.manifest.grid == dataclasses.replace(recipe.grid, multiple=network.config.patch)
     feeds = random_feeds(8, 12, seed=3)

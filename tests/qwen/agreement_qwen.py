@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from dior_rt.export.qwen.bundle import Recipe
+from dior_rt.export.qwen.bundle import QwenExportConfig
 from dior_rt.families.qwen.frame import Frame
 from dior_rt.families.qwen.model import Condition
 from dior_rt.families.qwen.template import Prompts
 
 AREA, VISION_AREA = 96 * 96, 64 * 64
-RECIPE = Recipe(
+RECIPE = QwenExportConfig(
     free_steps=True,
     area=AREA,
     vision_area=VISION_AREA,

@@ -92,9 +92,10 @@ def replace_scheduler(folder, copy, settings):
 
 def test_a_scheduler_of_another_kind_is_refused(folder, tmp_path):
     FlowMatchEulerDiscreteScheduler(shift=3.0, use_karras_sigmas=True).save_pretrained(folder / "scheduler")
-    refuse(folder, tmp_path, "asks for a schedule that this export does not know", InputError)
+    refuse(folder, tmp_path, "uses a schedule that this export does not support", InputError)
 
 
+@pytest.mark.slow
 def test_every_bundle_tells_what_its_precision_costs(make):
     parity = {
         p: read_bundle(make(precision=p, steps=6)).manifest.parity for p in ("fp32", "fp16", "int8", "int4")
@@ -225,7 +226,7 @@ def test_weights_that_are_not_finite_are_refused(folder, tmp_path):
     tensors = load_file(shard)
     next(iter(tensors.values())).view(-1)[0] = torch.inf
     save_file(tensors, shard)
-    refuse(folder, tmp_path, "holds values that are not finite", InputError)
+    refuse(folder, tmp_path, "contains values that are not finite", InputError)
 
 
 def test_a_tensor_that_is_not_there_is_named(folder, tmp_path):
@@ -238,7 +239,7 @@ def test_a_tensor_that_is_not_there_is_named(folder, tmp_path):
 def test_other_models_of_the_class_are_refused(folder, tmp_path, name):
     config = json.loads((folder / "transformer" / "config.json").read_text())
     (folder / "transformer" / "config.json").write_text(json.dumps({**config, name: True}))
-    refuse(folder, tmp_path, f"asks for {name}", InputError)
+    refuse(folder, tmp_path, f"sets {name}", InputError)
 
 
 def test_a_folder_that_is_no_model_is_refused(tmp_path):

@@ -57,7 +57,13 @@ def run_diffusers(pipe, pictures, canvas, steps, guidance, noise, monkeypatch):
 
 @pytest.mark.parametrize(
     ("zero", "size"),
-    [(True, (96, 96)), (False, (96, 96)), (True, (64, 128)), (False, (128, 64)), (True, (150, 70))],
+    [
+        (True, (64, 128)),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in [(True, (96, 96)), (False, (96, 96)), (False, (128, 64)), (True, (150, 70))]
+        ),
+    ],
     ids=str,
 )
 def test_forty_steps_paint_the_picture_that_diffusers_paints(qwens, pipes, monkeypatch, zero, size):
@@ -98,7 +104,7 @@ def test_only_the_right_guidance_and_light_paint_that_picture(qwens, pipes, monk
         assert got > 10 + psnr(qwen.decode_relit(run(qwen, other, 8, guidance), other), want)
 
 
-@pytest.mark.parametrize("steps", [4, 8])
+@pytest.mark.parametrize("steps", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_few_step_lora_beside_another_paints_what_diffusers_paints(folders, tmp_path, monkeypatch, steps):
     # As Lightning is published: bare keys with alpha, and the scheduler's settings that go with it.
     light = write_lora(tmp_path / "light.safetensors", "diffusers", rank=4)

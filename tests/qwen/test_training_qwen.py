@@ -22,7 +22,7 @@ from dior_rt.training import qwen as training
 from dior_rt.training.data.render import View
 from dior_rt.training.data.triplets import Batches, load_views
 from dior_rt.training.fit import Plan, flow_loss
-from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_own_strokes
+from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_estimated_strokes
 
 SAID = {MODES["relight"]: "light it from the left", MODES["estimate"]: "draw its light"}
 
@@ -91,6 +91,7 @@ def loss_of(transformer, prompts, batch):
         return float(flow_loss(network, batch, torch.tensor([1.0, 0.9, 0.7, 0.4]), noise))
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss_of_triplets_it_has_not_seen(trained, renders, prompts):
     batch = training.Pictures(tiny_qwen.vae(), 64 * 64).prepare(batch_of(renders))
     before = loss_of(tiny_qwen.transformer(), prompts, batch)
@@ -183,6 +184,7 @@ def pairs(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_stage_two_lowers_the_loss_on_real_pairs_it_has_not_drawn(
     folders, renders, pairs, trained, prompts, tmp_path
 ):
@@ -206,7 +208,7 @@ def test_stage_two_lowers_the_loss_on_real_pairs_it_has_not_drawn(
     assert len(losses) == 10 and np.isfinite(losses).all()
     unseen = MixedBatches(scenes, Batches(load_views(renders), 2, seed=9), (77,), 0, 0.5)
     before = backbone(file)
-    asked = with_own_strokes(before, next(iter(unseen)), 2, plan.shift)
+    asked = with_estimated_strokes(before, next(iter(unseen)), 2, plan.shift)
     given = before.prepare(asked)
     noise = torch.randn(given["x0"].shape, generator=torch.Generator().manual_seed(0))
 
@@ -261,6 +263,7 @@ def test_half_the_memory_trains_a_lora_in_single_precision(folders, renders, pro
     assert kept == {torch.bfloat16, torch.float32}
 
 
+@pytest.mark.slow
 def test_the_commands_train_resume_and_export(folders, renders, pairs, tmp_path, capfd):
     model, first, second = str(folders[True]), tmp_path / "first", tmp_path / "second"
     small = ["--side", "64", "--rank", "2", "--batch", "2"]

@@ -22,11 +22,9 @@ MANIFEST = Manifest(
     schedule=ShiftSchedule(8.0),
     steps=40,
     guidance=1.5,
-    colour="srgb",
     grid=GridRule(4096, 4, 256),
     noise_scale=1.0,
     parity={"evaluation": 1e-7},
-    settings={"text": "words", "whole": 3, "part": 0.5, "yes": True, "none": None},
 )
 
 
@@ -75,7 +73,7 @@ def test_what_is_written_is_read_back(tmp_path, files, manifest):
         (lambda d: d.update(format=3), "format 3, and this dior-rt reads 2: update"),
         (lambda d: d.update(format=1), "format 1, and this dior-rt reads 2: export its model again"),
         (lambda d: d.update(format="1"), "format"),
-        (lambda d: d.update(family="maxi"), "family"),
+        (lambda d: d.update(family=7), "family"),
         (lambda d: d.update(surprise=1), "unknown key 'surprise'"),
         (lambda d: d.pop("steps"), "lacks the key 'steps'"),
         (lambda d: d.update(steps=0), "steps"),
@@ -91,7 +89,8 @@ def test_what_is_written_is_read_back(tmp_path, files, manifest):
         (lambda d: d.update(schedule=[]), "schedule"),
         (lambda d: d["grid"].update(multiple=0), "grid"),
         (lambda d: d["graphs"]["velocity"].update(inputs=[{"name": "x"}]), "graphs.velocity.inputs[0]"),
-        (lambda d: d.update(settings={"list": []}), "settings.list"),
+        (lambda d: d.update(colour="linear"), "colour must be"),
+        (lambda d: d.update(settings={"list": []}), "settings must be {}"),
         (lambda d: d["files"].pop("probe.npz"), "probe.npz"),
         (lambda d: d["files"].pop("nets/model.onnx"), "nets/model.onnx"),
         (lambda d: d["files"].update({"gone.bin": "0" * 64}), "lacks its file 'gone.bin'"),

@@ -18,8 +18,9 @@ from dior_rt.errors import BundleError, InputError
 from dior_rt.flow.sampler import sample
 from dior_rt.flow.schedule import DynamicShiftSchedule
 from dior_rt.kernels import Stroke
-from dior_rt.presets import PRESETS, Preset, Sampling, read_presets, sampling
+from dior_rt.presets import PRESETS, Preset, read_presets
 from dior_rt.relight import Relighter
+from dior_rt.sampling import Sampling, SamplingFields, SamplingOptions, resolve_sampling
 
 FAST = Preset(2, "adams", 5.0, (0.9, 1.0))
 
@@ -46,15 +47,27 @@ def photo() -> np.ndarray:
 STROKES = [Stroke(((20, 20), (60, 40)), 12, (1.0, 0.8, 0.5), 1.5)]
 
 
+def resolve(bundle: Bundle, preset: str | None = None, **fields) -> Sampling:
+    return resolve_sampling(bundle, SamplingOptions(preset=preset, **fields))
+
+
 def test_the_reference_is_the_models_own(bundle: Bundle) -> None:
-    assert sampling(bundle) == Sampling(4, "euler", None, (0.0, 1.0), "reference", 2.0, None)
-    assert sampling(bundle, "reference") == sampling(bundle)
+    assert resolve(bundle) == Sampling(4, "euler", None, (0.0, 1.0), "reference", 2.0, None, 1.0)
+    assert resolve(bundle, "reference") == resolve_sampling(bundle)
 
 
 def test_what_is_asked_goes_over_the_preset(bundle: Bundle) -> None:
-    assert sampling(bundle, "fast") == Sampling(2, "adams", 5.0, (0.9, 1.0), "fast", 2.0)
-    asked = sampling(bundle, "fast", steps=7, solver=None, guidance=3.0, interval=(0.1, 0.2))
-    assert asked == Sampling(7, "adams", 5.0, (0.1, 0.2), "fast", 3.0)
+    assert resolve(bundle, "fast") == Sampling(2, "adams", 5.0, (0.9, 1.0), "fast", 2.0)
+    asked = resolve(bundle, "fast", steps=7, solver=None, guidance=3.0, interval=(0.1, 0.2), noise_scale=0.5)
+    assert asked == Sampling(7, "adams", 5.0, (0.1, 0.2), "fast", 3.0, None, 0.5)
+
+
+def test_keywords_go_over_the_options_and_are_the_same_fields() -> None:
+    options = SamplingOptions(steps=3, guidance=2.0)
+    assert options.override(steps=5, guidance=None) == SamplingOptions(steps=5, guidance=2.0)
+    assert SamplingFields.__annotations__.keys() == SamplingOptions.__dataclass_fields__.keys()
+    with pytest.raises(TypeError, match="sigma"):
+        options.override(sigma=1)
 
 
 @pytest.mark.parametrize(
@@ -68,6 +81,7 @@ def test_what_is_asked_goes_over_the_preset(bundle: Bundle) -> None:
         (None, {"interval": (-0.1, 0.2)}, "interval must be two numbers"),
         (None, {"interval": (float("nan"), 0.2)}, "interval must be two numbers"),
         (None, {"guidance": float("inf")}, "guidance must be"),
+        (None, {"noise_scale": -1.0}, "noise_scale must be"),
         (None, {"tolerance": 0.0}, "tolerance must lie between 0 and 1"),
         (None, {"tolerance": float("nan")}, "tolerance must lie between 0 and 1"),
         (None, {"tolerance": 0.01, "steps": 4}, "A tolerance chooses the steps"),
@@ -76,16 +90,16 @@ def test_what_is_asked_goes_over_the_preset(bundle: Bundle) -> None:
 )
 def test_what_cannot_be_is_one_sentence(bundle: Bundle, preset, asked, says: str) -> None:
     with pytest.raises(InputError, match=says):
-        sampling(bundle, preset, **asked)
+        resolve(bundle, preset, **asked)
 
 
 def test_a_model_with_another_schedule_or_no_grid_says_what_it_cannot(bundle: Bundle) -> None:
     schedule = DynamicShiftSchedule(0.5, 0.9, 256, 8192, 0.02)
     other = Bundle(bundle.folder, replace(bundle.manifest, schedule=schedule, grid=None))
     with pytest.raises(InputError, match="shift is not for the caller"):
-        sampling(other, shift=3.0)
+        resolve(other, shift=3.0)
     with pytest.raises(InputError, match="takes steps, not a tolerance"):
-        sampling(other, tolerance=0.01)
+        resolve(other, tolerance=0.01)
 
 
 def test_a_bundle_without_presets_has_the_reference_alone(mini_bundle: Path, tmp_path: Path) -> None:
@@ -94,7 +108,7 @@ def test_a_bundle_without_presets_has_the_reference_alone(mini_bundle: Path, tmp
     bare = Bundle(shipped.folder, replace(shipped.manifest, files=files))
     assert read_presets(bare) == {}
     with pytest.raises(InputError, match=r"only: reference\."):
-        sampling(bare, "fast")
+        resolve(bare, "fast")
 
 
 @pytest.mark.parametrize(
@@ -116,7 +130,7 @@ def test_a_preset_runs_its_solver_over_its_schedule_and_guides_in_its_interval(r
     """The same line of the picture, put together from the parts by hand."""
     family, grid = relighter._family, relighter._family.raster(60, 90)
     drawn = relighter._reduce_strokes(STROKES, (60, 90), grid, 1.0)
-    source, encoded = relighter._reduce_photo(photo, grid)
+    source, encoded = family.reduce_photo(photo, grid, relighter._ops)
     condition = family.encode(encoded, drawn, "relight")
     sigmas = np.array([1, 5 / 6, 0], np.float32)  # shift 5
     guided, plain = (family.velocity(condition, sigmas, scale) for scale in (2.0, 1.0))
@@ -127,6 +141,22 @@ def test_a_preset_runs_its_solver_over_its_schedule_and_guides_in_its_interval(r
     got = relighter.relight(photo, STROKES, preset="fast", seed=3)
     np.testing.assert_array_equal(got.picture, expected)
     assert got.steps == 2 and relighter.presets == ("reference", "fast", "balanced")
+
+
+def test_the_noise_is_as_strong_as_asked(relighter, photo) -> None:
+    without = [relighter.relight(photo, STROKES, noise_scale=0.0, seed=seed) for seed in (1, 2)]
+    np.testing.assert_array_equal(without[0].picture, without[1].picture)
+    options = SamplingOptions(noise_scale=1.0)
+    noisy = [relighter.relight(photo, STROKES, options, seed=seed).picture for seed in (1, 2)]
+    assert (noisy[0] != noisy[1]).any()
+    assert without[0].sampling.facts()["noise_scale"] == 0.0
+    silent = [relighter.estimate(photo, noise_scale=0.0, seed=seed) for seed in (1, 2)]
+    np.testing.assert_array_equal(*silent)
+
+
+def test_the_bundle_of_a_relighter_cannot_be_replaced(relighter, bundle) -> None:
+    with pytest.raises(AttributeError):
+        relighter.bundle = bundle
 
 
 def test_a_tolerance_tells_the_steps_it_took_and_progress_jumps_to_the_end(relighter, photo) -> None:

@@ -34,6 +34,7 @@ def strokes(size: tuple[int, int] = (67, 90)) -> Strokes:
     return Strokes(light, mask)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["fp32", "fp16", "int8"])
 def test_same_bytes_for_any_number_of_threads(bundle, hold, precision):
     pictures = []

@@ -84,6 +84,7 @@ def test_light_on_the_grid(ops, family, hold, case):
     hold(f"{case}: light on the grid", ops.name.split()[0], got.light, light, 1e-5, "of it", light + SMALLEST)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_picture_on_every_device(relighter, ops, expected, hold, case):
     loaded = relighter("fp32", ops.name.split()[0])

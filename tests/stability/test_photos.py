@@ -19,6 +19,7 @@ import png
 import pytest
 import tifffile
 import twin
+from float64_reference import unit
 from PIL import ExifTags, Image
 
 from dior_rt.bundle import default_bundle, read_bundle
@@ -205,7 +206,7 @@ def expected(family, network) -> Callable[[Case], np.ndarray]:
 def samples_of(path: Path) -> np.ndarray:
     """A written file's RGB samples as they are stored, 0..1."""
     if path.suffix == ".tif":
-        return twin.unit(tifffile.imread(path)[..., :3])
+        return unit(tifffile.imread(path)[..., :3])
     width, height, rows, info = png.Reader(filename=str(path)).read()
     pixels = np.vstack(list(rows)).reshape(height, width, info["planes"])[..., :3]
     return pixels / (2.0 ** info["bitdepth"] - 1)
@@ -222,7 +223,10 @@ def relight_file(loaded, case: Case, folder: Path) -> np.ndarray:
     return samples_of(made)
 
 
-@pytest.mark.parametrize("kind", [*CONTENTS, *KINDS])
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.slow] if "4000" in kind else []) for kind in (*CONTENTS, *KINDS)],
+)
 def test_every_kind_of_photo(relighter, ops, expected, hold, tmp_path, kind):
     case, name = {**CONTENTS, **KINDS}[kind], ops.name.split()[0]
     got = relight_file(relighter("fp32", name), case, tmp_path)

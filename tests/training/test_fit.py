@@ -12,19 +12,8 @@ from dior_rt.errors import InputError
 from dior_rt.export.lora import merge_lora
 from dior_rt.training.data.triplets import Batches
 from dior_rt.training.fit import STATE, Plan, draw_sigma, fit, fit_lora, flow_loss, response_loss
-from dior_rt.training.network import (
-    BOUNCED,
-    FLOOR,
-    LORA,
-    RELIT_SCALE,
-    WEIGHTS,
-    Config,
-    Mini,
-    linear_to_srgb,
-    load_network,
-    save_network,
-    srgb_to_linear,
-)
+from dior_rt.training.light import FLOOR, RELIT_SCALE, linear_to_srgb, srgb_to_linear
+from dior_rt.training.network import BOUNCED, LORA, WEIGHTS, Config, Mini, load_network, save_network
 
 TINY = Config(width=32, depth=1, heads=2, patch=8, fine=4, half=8, quarter=16)
 SHORT = Plan(steps=6, batch=2, rate=2e-3, warmup=2, average=2, save_every=2)
@@ -147,9 +136,9 @@ def test_the_photos_own_light_is_learnt_from_every_sample(views) -> None:
     batch, network = next(iter(Batches(views, 8, seed=3))), Mini(TINY)
     noise, sigma = torch.randn_like(batch["x0"]), torch.ones(8)
     without = {name: value for name, value in batch.items() if name != "own"}
-    plain, whole = (flow_loss(network, each, sigma, noise, own=0.5) for each in (without, batch))
+    plain, whole = (flow_loss(network, each, sigma, noise, source_weight=0.5) for each in (without, batch))
     _, light = network(
-        noise, sigma, batch["photo"], batch["light"], batch["mask"], batch["mode"], with_own=True
+        noise, sigma, batch["photo"], batch["light"], batch["mask"], batch["mode"], with_source=True
     )
     error = (2 * light - 1 - batch["own"]).square().mean()
     torch.testing.assert_close(whole, plain + 0.5 * error)
@@ -223,12 +212,12 @@ class Brush(torch.nn.Module):
         super().__init__()
         self.power = torch.nn.Parameter(torch.tensor(power))
 
-    def forward(self, x, sigma, photo, light, mask, mode, own=None, with_own=False):
+    def forward(self, x, sigma, photo, light, mask, mode, own=None, with_source=False):
         linear = srgb_to_linear(photo)
         ratio = self.power * torch.log((light + BOUNCED) / (0.25 + BOUNCED)) * mask
         relit = ((linear + FLOOR) * torch.exp(ratio) - FLOOR).clamp(0, 1)
         velocity = RELIT_SCALE * (photo - linear_to_srgb(relit))
-        return (velocity, torch.full_like(photo, 0.25)) if with_own else velocity
+        return (velocity, torch.full_like(photo, 0.25)) if with_source else velocity
 
 
 @pytest.mark.parametrize("power", [1.0, 0.5])

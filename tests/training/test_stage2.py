@@ -16,16 +16,8 @@ from dior_rt.export.lora import merge_lora
 from dior_rt.kernels import NumpyOps
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.fit import STATE, Plan, fit, flow_loss, rendered
-from dior_rt.training.network import (
-    LORA,
-    RELIT_SCALE,
-    WEIGHTS,
-    Config,
-    decode_light,
-    encode_light,
-    load_network,
-    srgb_to_linear,
-)
+from dior_rt.training.light import RELIT_SCALE, decode_lumi, encode_lumi, srgb_to_linear
+from dior_rt.training.network import LORA, WEIGHTS, Config, load_network
 from dior_rt.training.stage2 import (
     MixedBatches,
     Mixture,
@@ -34,7 +26,7 @@ from dior_rt.training.stage2 import (
     fit_stage2,
     load_scenes,
     real_pair,
-    with_own_strokes,
+    with_estimated_strokes,
 )
 
 OPS = NumpyOps()
@@ -81,7 +73,7 @@ class Oracle:
 
     class Flow(torch.nn.Module):
         def forward(self, x, sigma, photo, light, mask, mode):
-            x0 = 2 * encode_light(2 * srgb_to_linear(photo)) - 1
+            x0 = 2 * encode_lumi(2 * srgb_to_linear(photo)) - 1
             return (x - x0) / sigma[:, None, None, None]
 
     network = Flow()
@@ -90,7 +82,7 @@ class Oracle:
         return batch
 
     def lumi(self, x0, grid):
-        return decode_light((x0 + 1) / 2)
+        return decode_lumi((x0 + 1) / 2)
 
     def save(self, network):
         raise NotImplementedError
@@ -146,7 +138,7 @@ def test_real_pairs_are_driven_by_the_light_that_the_model_sees_in_their_target(
     pairs, renders, steps
 ) -> None:
     (batch,) = islice(mixed(pairs, renders), 1)
-    drawn = with_own_strokes(Oracle(), batch, steps, shift=8.0)
+    drawn = with_estimated_strokes(Oracle(), batch, steps, shift=8.0)
     target = batch["photo"] + batch["x0"] / RELIT_SCALE
     light = 2 * srgb_to_linear(target)
     shares = []
@@ -184,7 +176,7 @@ def unseen(stage1, pairs, renders, tmp_path_factory):
     (batch,) = islice(mixed(pairs, renders, start=900), 1)
     backbone = MiniLora(stage1, 1, tmp_path_factory.mktemp("unused"))
     noise = torch.randn(batch["x0"].shape, generator=torch.Generator().manual_seed(0))
-    return with_own_strokes(backbone, batch, 1, shift=8.0), noise
+    return with_estimated_strokes(backbone, batch, 1, shift=8.0), noise
 
 
 def losses_of(network: torch.nn.Module, unseen) -> list[float]:

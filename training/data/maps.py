@@ -56,7 +56,7 @@ DARKEST: Final = 1e-3  # reflectance that is divided by; no texture is as dark, 
 class Stages:
     """A scene's things: as they are and white, all without gloss, and white with a highlight."""
 
-    own: Stage
+    original_stage: Stage
     matte: Stage
     glossy: Stage
 
@@ -68,11 +68,11 @@ class Stages:
         def matte(material: Material) -> dict[str, Any]:
             return bsdf_of(replace(material, finish="matte", roughness=1.0))
 
-        own = Stage.load(things)
+        original_stage = Stage.load(things)
         return Stages(
-            own,
-            replace(own, original=load_shapes(things, matte)),
-            replace(own, white=load_shapes(things, white)),
+            original_stage,
+            replace(original_stage, original=load_shapes(things, matte)),
+            replace(original_stage, white=load_shapes(things, white)),
         )
 
 
@@ -103,7 +103,7 @@ class Shot:
 
     def lumi(self, stages: Stages) -> Raster:
         """(H, W, 3) the Lumi map."""
-        return self._of(lumi_map, stages.own)
+        return self._of(lumi_map, stages.original_stage)
 
     def phong(self, stages: Stages) -> Raster:
         """(H, W, 3) the Phong map."""
@@ -115,7 +115,7 @@ class Shot:
 
     def shading(self, stages: Stages, albedo: Raster) -> Raster:
         """(H, W, 3) the picture over the reflectance. albedo: what `albedo` gives."""
-        return over(self._of(picture, stages.own), albedo)
+        return over(self._of(picture, stages.original_stage), albedo)
 
     def albedo(self, stages: Stages) -> Raster:
         """(H, W, 3) the reflectance that the camera sees, whatever the source; 0 where it sees nothing."""

@@ -43,18 +43,18 @@ class Domain:
     """Where scenes come from, and how they are rendered.
 
     scene: of a number and a count of cameras. prefix: of its files' names, as domains may share a folder.
-    choosy: whether sources that light next to nothing of a view are left out. denoised: whether renders are.
+    skips_dim_sources: leave out sources that hardly light a view. denoised: whether renders are.
     """
 
     scene: Callable[[int, int], Scene]
     prefix: str
-    choosy: bool
+    skips_dim_sources: bool
     denoised: bool
 
 
 DOMAINS = {
-    "plain": Domain(scene, "", choosy=False, denoised=False),
-    "world": Domain(world, "world", choosy=True, denoised=True),
+    "plain": Domain(scene, "", skips_dim_sources=False, denoised=False),
+    "world": Domain(world, "world", skips_dim_sources=True, denoised=True),
 }
 
 
@@ -128,17 +128,17 @@ def render_scenes(
         import mitsuba_oidn  # noqa: F401
     make_folder(out)
     index, count = shard
-    mine = [seed * 1_000_000 + k for k in range(index, scenes, count)]
-    for done, number in enumerate(mine):
+    numbers = [seed * 1_000_000 + k for k in range(index, scenes, count)]
+    for done, number in enumerate(numbers):
         paths = [out / f"{chosen.prefix}{number:09d}-{v}.npz" for v in range(VIEWS)]
         if not all(path.exists() for path in paths):
             described = chosen.scene(number, VIEWS)
             stage = Stage.load(described.things)
             for path, camera in zip(paths, described.cameras, strict=True):
-                shown = lit(stage, described, camera) if chosen.choosy else described
+                shown = lit(stage, described, camera) if chosen.skips_dim_sources else described
                 view(stage, shown, camera, number, denoised=chosen.denoised).save(path)
         if progress:
-            progress(done + 1, len(mine))
+            progress(done + 1, len(numbers))
 
 
 @dataclass(frozen=True, eq=False)

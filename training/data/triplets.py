@@ -26,9 +26,10 @@ from dior_rt.families import Mode
 from dior_rt.families.mini import MODES
 from dior_rt.kernels import NumpyOps
 from dior_rt.kernels.ops import Mode as Sparsity
+from dior_rt.light import log_ratio
 from dior_rt.training.data.camera import Camera, random_camera, white_balance
 from dior_rt.training.data.render import View
-from dior_rt.training.network import RELIT_SCALE, encode_light
+from dior_rt.training.light import RELIT_SCALE, encode_lumi
 from dior_rt.training.scenes.textures import rainbow
 
 Lights = NDArray[np.float32]  # (sources, 3): strength times tint
@@ -207,7 +208,7 @@ def zoomed(sample: Pair, grid: tuple[int, int], mirror: bool = False) -> Pair:
 
 def interest(sample: Pair) -> Raster:
     """(h, w) where a person would draw: where the light changes most."""
-    change = np.abs(np.log((sample.target + 0.02) / (sample.source + 0.02))).max(axis=2)
+    change = np.abs(log_ratio(sample.target, sample.source)).max(axis=2)
     return (change**2 + 1e-6).astype(np.float32)
 
 
@@ -216,16 +217,16 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     if sample.kind == "dab":
         mask = dab(rng, interest(sample))
         return flat(sample.target, mask), mask
-    aimed = sample.kind in CHANGES and rng.uniform() < 0.85
+    at_change = sample.kind in CHANGES and rng.uniform() < 0.85
     modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
-    mode = "strokes" if aimed else modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
-    where = interest(sample) if aimed else None
+    mode = "strokes" if at_change else modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
+    where = interest(sample) if at_change else None
     # Who changes a light or all of them draws more than once; a lone stroke means its own place.
     times = 2 if mode == "strokes" and sample.kind in ("change", "replace") else 1
     drawn = [ops.sparsify(sample.target, mode, int(rng.integers(2**31)), where) for _ in range(times)]
     light = np.max([strokes.light for strokes in drawn], axis=0)
     mask = np.max([strokes.mask for strokes in drawn], axis=0)
-    return (flat(sample.target, mask) if aimed and rng.uniform() < 0.5 else light), mask
+    return (flat(sample.target, mask) if at_change and rng.uniform() < 0.5 else light), mask
 
 
 def dab(rng: Generator, interest: Raster) -> Raster:
@@ -287,7 +288,7 @@ class Batches(IterableDataset[dict[str, Tensor]]):
     def make(self, rng: Generator) -> dict[str, Tensor]:
         grid = self.grids[rng.integers(len(self.grids))]
         # Each sample draws for itself: what one view needs more or less does not change the others.
-        samples = [self._sample(own, grid) for own in rng.spawn(self.batch)]
+        samples = [self._sample(stream, grid) for stream in rng.spawn(self.batch)]
         return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
 
     def _sample(self, rng: Generator, grid: tuple[int, int]) -> dict[str, Tensor]:
@@ -328,14 +329,14 @@ def example(
         return torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1).contiguous()
 
     light, mask = strokes or (np.zeros_like(sample.photo), np.zeros(sample.photo.shape[:2], np.float32))
-    own = 2 * encode_light(planes(sample.source)) - 1
+    source = 2 * encode_lumi(planes(sample.source)) - 1
     return {
         "photo": planes(shots.photo),
         "light": planes(light),
         "mask": planes(mask[..., None]),
         "mode": torch.tensor(MODES[mode]),
-        "x0": RELIT_SCALE * planes(shots.change) if mode == "relight" else own,
-        "own": own,
+        "x0": RELIT_SCALE * planes(shots.change) if mode == "relight" else source,
+        "own": source,
     }
 
 

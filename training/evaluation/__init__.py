@@ -1,10 +1,10 @@
-"""How well a method relights: benchmarks, baselines, measures, and the report of them.
+"""Measure how well a method relights: benchmarks, baselines, measures and reports.
 
-metrics, lpips        pictures, and series of figures, to numbers
-tasks, benchmarks     what a benchmark is made of; the benchmarks in a folder
-layouts               benchmarks of real photos, as others published them
-synthbench, people    the renders of SynthBench, and the figures in them
-methods, baselines    what is evaluated, and what needs no network
-control               how a picture answers to the brush
-run, results, report  a method over a benchmark; its records; JSON, Markdown, contact sheet
+metrics, lpips        measures of pictures and of series of figures
+tasks, benchmarks     one pair of pictures; the benchmarks in a folder
+layouts               published benchmarks of real photos
+synthbench, people    renders SynthBench and its human figures
+methods, baselines    the evaluated methods, and methods without a network
+control               how a picture responds to the brush
+run, results, report  runs a method on a benchmark; its results; JSON, Markdown, contact sheet
 """

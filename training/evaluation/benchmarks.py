@@ -1,6 +1,7 @@
 """The benchmarks in a folder, known by its layout.
 
 renders      {scene}-{view}.npz of `dior-rt train render`
+RealBench    realbench.json and {pair}/ of `dior-rt train realbench`
 SynthBench   synthbench.json and {pair}/ of `dior-rt train synthbench`
 MultiIllum   {scene}/dir_{0..24}_mip{m}.jpg or .exr
 ReNe         {scene}/lset{000..039}/data/{00000..00049}_image.png
@@ -20,6 +21,7 @@ from dior_rt.errors import InputError
 from dior_rt.images.strokes import read_lumi
 from dior_rt.training.data.render import View
 from dior_rt.training.data.triplets import Pair, interest, pair
+from dior_rt.training.evaluation.judges.realbench import realbench
 from dior_rt.training.evaluation.layouts import multi_illum, read_picture, rene
 from dior_rt.training.evaluation.tasks import OPS, Benchmark, Task
 
@@ -29,12 +31,12 @@ LAST: Final = "target.png"  # what is written last of a pair: where it is, the p
 
 def open_benchmarks(folder: Path) -> list[Benchmark]:
     """The benchmarks in a folder, known by their layout. Raises InputError for a folder of none."""
-    for kind in (renders, synthbench, multi_illum, rene):
+    for kind in (renders, realbench, synthbench, multi_illum, rene):
         if folder.is_dir() and (found := kind(folder)):
             return found
     raise InputError(
-        f"There are no renders in {folder}, and it is laid out like none of SynthBench, MultiIllum and ReNe; "
-        f"make renders with `dior-rt train render --out {folder}`."
+        f"There are no renders in {folder}, and it is laid out like none of RealBench, SynthBench, "
+        f"MultiIllum and ReNe; make renders with `dior-rt train render --out {folder}`."
     )
 
 

@@ -1,4 +1,4 @@
-"""How a picture answers to the brush: dabs of light on photos whose own light is known."""
+"""Measure how a picture responds to the brush: dabs of light on photos with a known Lumi map."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ HUES: Final[tuple[Color, ...]] = (
     (0.05, 0.05, 1),
     (1, 0.05, 1),
 )
-DAB: Final = 1 / 6  # a dab's width, of the picture's
-FAR: Final = 2 * DAB  # from a dab's centre, of the picture's width
-DARKEST: Final = 0.05  # light below which a dab takes DEFAULT_LIGHT as its base
+DAB: Final = 1 / 6  # a dab's width, as a share of the picture's
+FAR: Final = 2 * DAB  # distance from a dab's centre, as a share of the picture's width
+DARKEST: Final = 0.05  # below this light, a dab is relative to DEFAULT_LIGHT
 DEFAULT_LIGHT: Final = 0.5
-SAME: Final = 2  # of 255: what differs by no more is the same
-WORSE: Final = 0.5  # of 255: by how much the RMSE may rise before a stroke counts as harmful
+SAME: Final = 2  # in 1/255: smaller differences count as equal
+WORSE: Final = 0.5  # in 1/255: how much the RMSE may rise before a stroke counts as harmful
 MOST_STROKES: Final = 5
 
 
@@ -55,9 +55,9 @@ MOST_STROKES: Final = 5
 class Response:
     """How the picture follows a white dab at INTENSITIES times the light that is there.
 
-    slope: the mean over dabs of the exponent of linear light against intensity; 1 is light in proportion.
-    monotonic: the share of dabs under which every step up in intensity is one in light. leakage: the change
-    FAR from the strongest dab over that under it, the median.
+    slope: the mean over dabs of the exponent of linear light against intensity; 1 is in proportion.
+    monotonic: the share of dabs under which every increase in intensity brightens the light.
+    leakage: the median change FAR from the strongest dab, divided by the change under it.
     """
 
     slope: float
@@ -71,8 +71,8 @@ class Chroma:
     """Median angles in degrees, over saturated dabs twice as strong as the light that is there.
 
     chromaticity: between the RGB of the picture under a dab and that of the same surfaces under the dab's
-    light, photo * dab / (light that is there). hue: between the dab's hue and that of the light it adds,
-    which the surface's own colour tilts.
+    light, photo * dab / (light that is there). hue: between the hues of the dab and of the added light; the
+    surface's colour shifts it.
     """
 
     chromaticity: float
@@ -81,15 +81,18 @@ class Chroma:
 
 @dataclass(frozen=True)
 class Progress:
-    """What each further stroke of the true map does. not_worse: the share that raise the RMSE by no more than
-    WORSE. gain: in dB of PSNR, from the first stroke to the last, the mean."""
+    """The effect of each further stroke of the true map.
+
+    not_worse: the share of strokes that raise the RMSE by no more than WORSE. gain: the mean gain of PSNR
+    in dB from the first stroke to the last.
+    """
 
     not_worse: float
     gain: float
 
 
 def response(relight: Relight, tasks: Iterable[Task]) -> Response:
-    """One dab a task."""
+    """Measure one white dab per task."""
     slopes, monotonic, leaks = [], [], []
     for task in tasks:
         at, base = _place(task)
@@ -108,7 +111,7 @@ def response(relight: Relight, tasks: Iterable[Task]) -> Response:
 
 
 def chroma(relight: Relight, tasks: Iterable[Task]) -> Chroma:
-    """Dabs of all HUES on each task."""
+    """Measure dabs of all HUES on each task."""
     chromaticity, hue = [], []
     for task in tasks:
         assert task.source_lumi is not None
@@ -123,7 +126,7 @@ def chroma(relight: Relight, tasks: Iterable[Task]) -> Chroma:
 
 
 def progress(relight: Relight, tasks: Iterable[Task]) -> Progress | None:
-    """A task's strokes, one more each time; None where no task has two that do not touch."""
+    """Add a task's strokes one by one. Return None if no task has two separate strokes."""
     from scipy.ndimage import label
 
     shares, gains = [], []
@@ -142,8 +145,10 @@ def progress(relight: Relight, tasks: Iterable[Task]) -> Progress | None:
 
 
 def keep_psnr(relight: Relight, tasks: Iterable[Task]) -> float:
-    """PSNR to the photo, in dB, where no stroke speaks and the truth is the photo: within SAME, of pixels of
-    all tasks together. 100 where there are none."""
+    """Return the PSNR to the photo in dB, outside the strokes, where the truth equals the photo within SAME.
+
+    All tasks are pooled. Without such pixels it is 100.
+    """
     squares = []
     for task in tasks:
         strokes = task.control("strokes")
@@ -156,8 +161,10 @@ def keep_psnr(relight: Relight, tasks: Iterable[Task]) -> float:
 
 @dataclass(frozen=True)
 class Borders:
-    """Over photos: differences across patch borders over those inside, in the light map that a white dab
-    makes and in the estimated one, both as logarithms; the means over photos."""
+    """Differences across patch borders divided by those inside patches, the means over photos.
+
+    relit: in the logarithm of the light that a white dab makes. estimated: in that of the estimated map.
+    """
 
     relit: float
     estimated: float
@@ -167,7 +174,7 @@ class Borders:
 def borders(
     relight: Relight, estimate: Callable[[Photo], Raster], grid: GridRule, photos: Iterable[Photo]
 ) -> Borders:
-    """The photos are seen at grid size, so that light reaches them cell by cell. patch: grid.multiple."""
+    """Measure `Borders` on photos at grid size, where each pixel is a cell. patch: grid.multiple."""
     relit, estimated = [], []
     for photo in photos:
         light = OPS.reduce_photo(photo, grid.shape(*photo.shape[:2]))
@@ -180,12 +187,12 @@ def borders(
 
 
 def dab(photo: NDArray, at: tuple[float, float], color: Color, intensity: float) -> Strokes:
-    """One round touch of the brush, centred at (x, y)."""
+    """Return one round dab centred at (x, y)."""
     return OPS.draw_strokes([Stroke((at,), DAB * photo.shape[1], color, intensity)], photo.shape[:2])
 
 
 def _place(task: Task) -> tuple[tuple[float, float], float]:
-    """A place for a dab away from the border, and the light there."""
+    """Return a place for a dab away from the border, and the light there."""
     assert task.source_lumi is not None
     height, width = task.source.shape[:2]
     x, y = np.random.default_rng([task.seed, 3]).uniform(0.2, 0.8, 2)

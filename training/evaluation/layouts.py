@@ -36,7 +36,7 @@ def multi_illum(folder: Path) -> list[Benchmark]:
             source = photos[number - len(photos) // 2]
             if source != target:
                 name = "-".join([scene.name, *(path.name.split("_")[1] for path in (source, target))])
-                load.append(partial(_photographed, name, source, target, number))
+                load.append(partial(photographed, name, source, target, number))
     return [Benchmark("MultiIllum", tuple(load), False)] if load else []
 
 
@@ -60,7 +60,7 @@ def rene(folder: Path) -> list[Benchmark]:
             if source != target and (camera := _shared_camera(source / "data", target / "data", 7 * number)):
                 name = f"{scene.name}-{source.name}-{target.name}-{camera[:5]}"
                 load.append(
-                    partial(_photographed, name, source / "data" / camera, target / "data" / camera, number)
+                    partial(photographed, name, source / "data" / camera, target / "data" / camera, number)
                 )
     return [Benchmark("ReNe", tuple(load), False)] if load else []
 
@@ -76,7 +76,7 @@ def _lit(path: Path) -> bool:
     return bool(read_picture(path).any())
 
 
-def _photographed(name: str, source: Path, target: Path, seed: int) -> Task:
+def photographed(name: str, source: Path, target: Path, seed: int) -> Task:
     """A pair of photos; linear ones share one exposure, under which neither is lost in white."""
     if source.suffix == ".exr":
         linear = [read_exr(path, "photo")[..., :3] for path in (source, target)]

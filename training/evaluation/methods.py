@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from dior_rt.errors import InputError
 from dior_rt.kernels import Strokes
 from dior_rt.reach import check_reach
 from dior_rt.relight import Relighter
+from dior_rt.sampling import SamplingOptions, resolve_sampling
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.metrics import Photo, Raster
 from dior_rt.training.evaluation.tasks import Task
@@ -38,21 +38,23 @@ class Model:
     """A bundle by the runtime as people run it, one seed for all pictures. settings: as used."""
 
     def __init__(self, relighter: Relighter, settings: Settings = Settings()) -> None:
-        given = {name: value for name, value in asdict(settings).items() if value is not None}
-        given.pop("reach", None)  # a bundle has none of its own
-        manifest = replace(relighter.bundle.manifest, **given)
-        self.relighter = copy(relighter)
-        self.relighter.bundle = replace(relighter.bundle, manifest=manifest)
-        self.name, self.grid = manifest.name, manifest.grid
-        self.settings = Settings(manifest.steps, manifest.guidance, manifest.noise_scale, settings.reach)
+        manifest = relighter.bundle.manifest
+        self.relighter, self.name, self.grid = relighter, manifest.name, manifest.grid
+        self.options = SamplingOptions(
+            steps=settings.steps, guidance=settings.guidance, noise_scale=settings.noise_scale
+        )
+        used = resolve_sampling(relighter.bundle, self.options)
+        self.settings = Settings(used.steps, used.guidance, used.noise_scale, settings.reach)
 
     def relight(self, photo: Photo | Raster, strokes: Strokes) -> Photo:
         """The photo, 8-bit or float sRGB, under the strokes; what comes back is of its dtype."""
-        return np.asarray(self.relighter.relight(photo, strokes, reach=self.settings.reach).picture)
+        return np.asarray(
+            self.relighter.relight(photo, strokes, self.options, reach=self.settings.reach).picture
+        )
 
-    def estimate(self, photo: Photo) -> Raster:
+    def estimate(self, photo: Photo | Raster) -> Raster:
         """The photo's own light on the light grid, (h, w, 3) linear."""
-        return self.relighter.estimate(photo)
+        return self.relighter.estimate(photo, self.options)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from dior_rt.kernels.color import linear_to_srgb
+from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 
 Photo = NDArray[np.uint8]
 Raster = NDArray[np.float32]
@@ -36,6 +36,14 @@ def decibels(square: float, peak: float = 255.0) -> float:
 def psnr(picture: Photo, truth: Photo) -> float:
     """In dB."""
     return decibels(mean_square(picture, truth))
+
+
+def scale_invariant_psnr(picture: Photo, truth: Photo) -> float:
+    """PSNR in dB after the one factor on the picture's linear light that fits the truth's best."""
+    light, wanted = (srgb_to_linear(shown.astype(np.float64) / 255) for shown in (picture, truth))
+    factor = float((light * wanted).sum() / max(float(np.square(light).sum()), DARK**2))
+    scaled = 255 * linear_to_srgb(np.clip(light * factor, 0, 1))
+    return decibels(float(np.square(scaled - truth).mean()))
 
 
 def ssim(picture: Photo, truth: Photo) -> float:

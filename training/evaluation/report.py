@@ -86,7 +86,7 @@ def _line(row: Row) -> str:
 
 
 def _figure(name: str, figure: Figure) -> str:
-    places = DECIMALS.get(name, 3)
+    places = DECIMALS.get(name.split()[0].removeprefix("SI-"), 3)
     return f"{figure.mean:.{places}f} ({figure.low:.{places}f} to {figure.high:.{places}f})"
 
 

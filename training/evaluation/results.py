@@ -1,4 +1,4 @@
-"""What was measured, as records."""
+"""The results of an evaluation as records."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ class Figure:
 
     @staticmethod
     def of(values: Sequence[float]) -> Figure:
-        """Of at least one value."""
+        """Return the mean and interval of at least one value."""
         return Figure(float(np.mean(values)), *interval(values))
 
 
 @dataclass(frozen=True)
 class Row:
-    """A method's figures, by the measure's name. control: what light it was given. seconds: a picture."""
+    """A method's figures by measure. control: the light that drove it. seconds: per picture."""
 
     method: str
     control: str
@@ -40,8 +40,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """estimate: PSNR in dB of the estimated map of the source, after the best global scale, where a true one
-    is known. control: where the light that methods are given comes from."""
+    """The results on one benchmark.
+
+    estimate: PSNR in dB of the estimated map of the source after the best global scale, if the true map is
+    known.
+    control: the origin of the control.
+    """
 
     benchmark: str
     pictures: int
@@ -52,7 +56,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Example:
-    """What the contact sheet shows of one task."""
+    """One row of the contact sheet."""
 
     task: Task
     strokes: Strokes | None
@@ -61,7 +65,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Control:
-    """See `control`; progress is None where no task has two strokes."""
+    """The figures of module `control`. progress: None if no task has two strokes."""
 
     response: Response
     chroma: Chroma
@@ -72,7 +76,7 @@ class Control:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All that was measured of one method. settings: as used, or None for a folder of pictures."""
+    """All results of one method. settings: as used, or None for a folder of pictures."""
 
     method: str
     settings: Settings | None

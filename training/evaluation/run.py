@@ -16,15 +16,21 @@ from dior_rt.kernels import Strokes
 from dior_rt.training.evaluation import control
 from dior_rt.training.evaluation.baselines import gain, match, quotient
 from dior_rt.training.evaluation.benchmarks import open_benchmarks, renders
+from dior_rt.training.evaluation.judges.models import Blur, BundleModel, Glow
 from dior_rt.training.evaluation.layouts import read_picture
 from dior_rt.training.evaluation.lpips import BACKBONES, Lpips
 from dior_rt.training.evaluation.methods import Model, Pictures, Settings, open_method
-from dior_rt.training.evaluation.metrics import Photo, psnr, rmse, scaled_psnr, ssim
+from dior_rt.training.evaluation.metrics import Photo, psnr, rmse, scale_invariant_psnr, scaled_psnr, ssim
 from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import DRAWN, OPS, Benchmark, Task
 
 Measure = Callable[[Photo, Photo], float]
-MEASURES: Final[Mapping[str, Measure]] = {"PSNR": psnr, "RMSE": rmse, "SSIM": ssim}
+MEASURES: Final[Mapping[str, Measure]] = {
+    "PSNR": psnr,
+    "SI-PSNR": scale_invariant_psnr,
+    "RMSE": rmse,
+    "SSIM": ssim,
+}
 EXAMPLES: Final = 8  # of a benchmark, for the contact sheet
 SECONDS: Final = "seconds"
 PHOTOS: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
@@ -149,9 +155,9 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
     yield Answer("copy", "", task.source)
     yield Answer("gain", "target's colours", gain(task.source, task.truth))
     yield Answer("mean and deviation", "target's colours", match(task.source, task.truth))
-    for maps, known in (("true maps", task), ("estimated maps", estimated)):
-        if known and known.source_lumi is not None and known.target_lumi is not None:
-            yield Answer("quotient", maps, quotient(task.source, known.source_lumi, known.target_lumi))
+    for maps, lit_task in (("true maps", task), ("estimated maps", estimated)):
+        if lit_task and lit_task.source_lumi is not None and lit_task.target_lumi is not None:
+            yield Answer("quotient", maps, quotient(task.source, lit_task.source_lumi, lit_task.target_lumi))
     if isinstance(method, Pictures):
         strokes = task.control("strokes") if task.target_lumi is not None else None
         yield Answer(method.name, "", method.picture(task), strokes=strokes)
@@ -160,6 +166,9 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
     assert driving
     for drawn in DRAWN:
         strokes = driving.control(drawn)
+        if drawn == "strokes":
+            for model in (Glow(BundleModel(method)), Blur()):
+                yield Answer(model.name, drawn, model.relight(task.source, strokes))
         began = time.perf_counter()
         picture = method.relight(task.source, strokes)
         yield Answer(method.name, drawn, picture, time.perf_counter() - began, strokes)
@@ -168,7 +177,7 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
 def _estimated(model: Model, task: Task) -> Task:
     """The task with the light that the model sees in its two pictures, on the light grid."""
     source, target = model.estimate(task.source), model.estimate(task.truth)
-    return replace(task, source_lumi=source, target_lumi=target, mask=None, interest=None)
+    return replace(task, source_lumi=source, target_lumi=target, mask=None, interest=None, strokes=None)
 
 
 def _estimate_psnr(estimated: Task, task: Task) -> float:

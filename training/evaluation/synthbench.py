@@ -1,17 +1,17 @@
-"""SynthBench: rendered pairs whose lights differ much, with their true Lumi maps, made from a seed.
+"""SynthBench: rendered pairs with very different lights and their true Lumi maps, made from a seed.
 
     {out}/synthbench.json          format, seed, pairs, resolution and samples
     {out}/{pair}/source.png        the photo, 8-bit sRGB
     {out}/{pair}/target.png        the truth
     {out}/{pair}/*_lumi.exr        their Lumi maps, linear
-    {out}/{pair}/mask.png          white where the benchmark's strokes speak; their light is the target's map
+    {out}/{pair}/mask.png          white under the benchmark's strokes; their light is the target's map
 
 Copying the source scores at most MOST_COPY dB on every pair. Scene numbers lie above all those that
-`dior-rt train render` can reach, so no geometry was ever trained on; in every second pair stands a human
-figure, a kind of thing that training has none of. Half of the pairs are plain scenes, half are of the world.
+`dior-rt train render` can reach, so training never sees their geometry. Every second pair contains a human
+figure, which training never sees either. Half of the pairs are plain scenes, half are of the world domain.
 
-Lights are decided on by a preview of few rays; only sources that are lit in one of the two pictures are then
-rendered in full.
+A preview with few rays decides on the lights. Then only the sources that are lit in one of the two pictures
+are rendered in full.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from dior_rt.training.evaluation.tasks import OPS, Task
 from dior_rt.training.scenes.scene import Camera, Scene
 
 MOST_COPY: Final = 15.0  # dB
-DRAWS: Final = 200  # of lights in a scene, before the next scene is tried
-FIRST: Final = 901_000_000  # the first scene number; `render` has those below
-STRIDE: Final = 1000  # scene numbers from pair to pair; of seeds, 1000 pairs
+DRAWS: Final = 200  # draws of lights before the next scene is tried
+FIRST: Final = 901_000_000  # the first scene number; `render` uses smaller ones
+STRIDE: Final = 1000  # scene numbers per pair; each seed has room for 1000 pairs
 FORMAT: Final = 2
-PREVIEW: Final = 2  # rays a pixel and source, of half as many pixels a side
-MARGIN: Final = 0.5  # dB that a preview has to stay below MOST_COPY
+PREVIEW: Final = 2  # rays per pixel and source, at half the resolution
+MARGIN: Final = 0.5  # dB by which a preview must stay below MOST_COPY
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a SynthBench is made from. resolution: pixels a side. samples: rays a pixel and source, before
-    denoising.
+    """The settings of a SynthBench.
 
-    speckle: the most that either picture may have, in 0..255; photos of 128 x 128 pixels have 5 to 8.
+    resolution: pixels a side. samples: rays per pixel and source, before denoising.
+    speckle: the largest allowed noise of either picture, in 0..255; photos of 128 x 128 pixels have 5 to 8.
     """
 
     pairs: int = 600
@@ -71,27 +71,30 @@ def render_synthbench(
     shard: tuple[int, int] = (0, 1),
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Render the pairs that are not there yet. shard: (index, count), this process's share.
+    """Render the missing pairs. shard: (index, count), this process's share.
 
-    Raises InputError where nothing can be written, or where the folder holds another recipe's pairs.
+    Raises InputError if nothing can be written, or if the folder holds pairs with other settings.
     """
-    mitsuba()  # where it or the figures are missing, no folder is made
+    mitsuba()  # without it or the figures, no folder is made
     person(np.random.default_rng(0), 1.0, 0.0, np.zeros(3))
     make_folder(out)
     _agree(out / HEAD, recipe)
     index, shards = shard
-    mine = range(index, recipe.pairs, shards)
-    for done, number in enumerate(mine):
+    numbers = range(index, recipe.pairs, shards)
+    for done, number in enumerate(numbers):
         folder = out / f"{number:04d}"
         if not (folder / LAST).exists():
             _save(folder, make(number, recipe))
         if progress:
-            progress(done + 1, len(mine))
+            progress(done + 1, len(numbers))
 
 
 def make(number: int, recipe: Recipe) -> Task:
-    """The pair of that number: of the first of its STRIDE scenes with lights that differ enough and leave
-    little noise. Raises InputError where there is none."""
+    """Return the pair of that number.
+
+    It is made from the first of its STRIDE scenes whose lights differ enough and leave little noise. Raises
+    InputError if there is none.
+    """
     first = FIRST + recipe.seed * 1_000 * STRIDE + number * STRIDE
     for scene_number in range(first, first + STRIDE):
         described = staged(scene_number, number)
@@ -107,17 +110,17 @@ def make(number: int, recipe: Recipe) -> Task:
         if psnr(source, truth) <= MOST_COPY and max(map(speckle, (source, truth))) <= recipe.speckle:
             mask = OPS.sparsify(sample.target, "strokes", number).mask
             return Task(f"{number:04d}", source, truth, sample.source, sample.target, mask, seed=number)
-    raise InputError(f"Pair {number} finds no scene without noise; take more samples than {recipe.samples}.")
+    raise InputError(f"Pair {number} has no scene without noise; take more samples than {recipe.samples}.")
 
 
 def shown(seen: View, seed: list[int]) -> tuple[Pair, Shown, Shown]:
-    """The pair of a view that a seed draws, and its pictures as they are shown."""
+    """Return the pair of a view that a seed draws, and its pictures in 8-bit sRGB."""
     sample = pair(np.random.default_rng(seed), seen, "replace")
     return sample, OPS.encode_srgb(sample.photo, np.uint8), OPS.encode_srgb(sample.relit, np.uint8)
 
 
 def differing(preview: View) -> list[int] | None:
-    """The first seed whose lights differ enough by a preview, or None."""
+    """Return the first seed whose lights differ enough in the preview, or None."""
     for draw in range(DRAWS):
         seed = [preview.seed, 5, draw]
         _, source, truth = shown(preview, seed)
@@ -127,7 +130,7 @@ def differing(preview: View) -> list[int] | None:
 
 
 def used(preview: View, seed: list[int]) -> NDArray[np.bool_]:
-    """(sources,) which are lit in either picture of the pair that the seed draws."""
+    """Return which sources are lit in either picture of the seed's pair, (sources,) bool."""
     rng = np.random.default_rng(seed)
     usable = usable_sources(preview)
     lights = random_lights(rng, usable) + random_lights(rng, usable)
@@ -137,7 +140,7 @@ def used(preview: View, seed: list[int]) -> NDArray[np.bool_]:
 def in_full(
     stage: Stage, described: Scene, camera: Camera, preview: View, chosen: NDArray[np.bool_], recipe: Recipe
 ) -> View:
-    """The previewed view with the chosen sources rendered in full, and denoised; the others are dark."""
+    """Return the view with the chosen sources rendered in full and denoised; the others are dark."""
     lamps = replace(described, sources=tuple(described.sources[k] for k in np.flatnonzero(chosen)))
     full = view(stage, lamps, camera, preview.seed, recipe.resolution, recipe.samples, denoised=True)
     images = np.zeros((chosen.size, *full.images.shape[1:]), np.float16)
@@ -147,8 +150,10 @@ def in_full(
 
 
 def staged(scene_number: int, number: int) -> Scene:
-    """A scene for the pair of that number, by one camera: with a human figure in front if it is odd, of the
-    world if its half is."""
+    """Return a scene with one camera for the pair of that number.
+
+    Odd pairs have a human figure in front. Pairs whose half is odd are of the world domain.
+    """
     described = DOMAINS["world" if number // 2 % 2 else "plain"].scene(scene_number, 1)
     if number % 2 == 0:
         return described
@@ -159,20 +164,20 @@ def staged(scene_number: int, number: int) -> Scene:
 
 
 def _agree(path: Path, recipe: Recipe) -> None:
-    """Write the recipe, or see that it is the one that is there."""
+    """Write the settings, or check that the folder has the same."""
     if not path.exists():
         with replacing(path) as file:
             file.write(json.dumps(asdict(recipe), indent=2).encode())
     try:
         there = parse(Recipe, read_json(path, 1 << 16))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} describes no SynthBench.") from error
+        raise InputError(f"{path} does not describe a SynthBench.") from error
     if replace(there, pairs=recipe.pairs) != recipe:
-        raise InputError(f"{path.parent} holds a SynthBench of another recipe; name another folder.")
+        raise InputError(f"{path.parent} holds a SynthBench with other settings; choose another folder.")
 
 
 def _save(folder: Path, task: Task) -> None:
-    """Write a pair; the truth last, so that a pair that has it is whole."""
+    """Write a pair. The truth is written last, so a pair with a truth is complete."""
     assert task.source_lumi is not None and task.target_lumi is not None and task.mask is not None
     make_folder(folder)
     white = (task.mask * 255).astype(np.uint8)

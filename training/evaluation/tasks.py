@@ -23,6 +23,7 @@ class Task:
     source, truth: (H, W, 3) 8-bit sRGB. source_lumi, target_lumi: (h, w, 3) linear Lumi maps, of the
     pictures' size if true, of the light grid if estimated, or None. mask: (h, w), where the benchmark's own
     strokes speak. Without it they are cut out of the target's map: seed and `interest` (h, w) say where.
+    strokes: the benchmark's own, in place of a mask.
     """
 
     name: str
@@ -33,12 +34,15 @@ class Task:
     mask: Raster | None = None
     interest: Raster | None = None
     seed: int = 0
+    strokes: Strokes | None = None
 
     def control(self, drawn: Drawn) -> Strokes:
         """The target's map, whole, or strokes cut out of it."""
         assert self.target_lumi is not None
         if drawn == "dense":
             return Strokes(self.target_lumi, np.ones(self.target_lumi.shape[:2], np.float32))
+        if self.strokes is not None:
+            return self.strokes
         if self.mask is not None:
             return Strokes(np.where(self.mask[..., None] > 0, self.target_lumi, 0), self.mask)
         return OPS.sparsify(self.target_lumi, "strokes", self.seed, interest=self.interest)

@@ -1,49 +1,25 @@
-"""The network of the mini family: its configuration, features, layers and checkpoint files."""
+"""The network of the mini family: its configuration, features, layers, model and checkpoint files."""
 
-from dior_rt.training.network.model import (
-    BOUNCED,
-    FLOOR,
-    LARGEST_LOGIT,
-    LORA,
-    LUMI_SCALE,
-    RELIT_SCALE,
-    WEIGHTS,
-    Block,
-    Config,
-    Features,
-    Mini,
-    Turns,
-    decode_light,
-    encode_light,
-    linear_to_srgb,
-    load_network,
-    rotate,
-    rotations,
-    save_network,
-    srgb_to_linear,
-    velocity,
-)
+from dior_rt.training.network.checkpoint import LORA, WEIGHTS, load_network, save_network
+from dior_rt.training.network.config import Config
+from dior_rt.training.network.features import BOUNCED, Features, InputChannels
+from dior_rt.training.network.layers import LARGEST_LOGIT, Block, Rotation, rotate, rotations
+from dior_rt.training.network.model import Mini, velocity
 
 __all__ = [
     "BOUNCED",
-    "FLOOR",
     "LARGEST_LOGIT",
     "LORA",
-    "LUMI_SCALE",
-    "RELIT_SCALE",
     "WEIGHTS",
     "Block",
     "Config",
     "Features",
+    "InputChannels",
     "Mini",
-    "Turns",
-    "decode_light",
-    "encode_light",
-    "linear_to_srgb",
+    "Rotation",
     "load_network",
     "rotate",
     "rotations",
     "save_network",
-    "srgb_to_linear",
     "velocity",
 ]

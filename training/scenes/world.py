@@ -89,14 +89,13 @@ def _stand(
 
 def _small(rng: Generator) -> Mesh:
     """Anything that may stand on a table."""
-    kind = rng.choice(6, p=[0.3, 0.2, 0.1, 0.15, 0.25, 0.0])
+    kind = rng.choice(5, p=[0.3, 0.2, 0.1, 0.15, 0.25])
     makers = (
         compound_meshes.vessel,
         compound_meshes.extruded,
         compound_meshes.knot,
         compound_meshes.rock,
         shapes.random_shape,
-        compound_meshes.plant,
     )
     return makers[kind](rng)
 

@@ -1,10 +1,10 @@
-"""The ablation: what the Lumi map, and stage 2, are worth. One row a representation of light, one budget.
+"""The ablation: compare representations of light, and training with and without stage 2, at one budget.
 
-Each row learns from nothing, from the same seed, views and kinds of pairs: stage 1 on renders, then a LoRA
-by stage 2. Real photos are stood in for by pictures that random cameras take of scenes that no row trains on.
-The last row's LoRA sees renders alone, so it differs from the first in nothing but the photos. The control
-that a row is judged under is of its own representation, and also of the Lumi map: what a person draws who
-thinks of lamps, and of nothing that they do to one another.
+Each row trains from scratch with the same seed, views and kinds of pairs: stage 1 on renders, then a LoRA
+by stage 2. Pictures that random cameras take of scenes that no row trains on stand in for real photos. The
+last row's LoRA sees renders alone, so it differs from the first row only in the photos. Each row is judged
+under control cut from its own representation, and under control cut from the Lumi map, because people draw
+lamps and not their indirect effects.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.grid import GridRule
 from dior_rt.kernels import Strokes
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
+from dior_rt.light import relit_from_x0
 from dior_rt.training.backbone import MiniLora
 from dior_rt.training.data.maps import LUMI
 from dior_rt.training.data.photos import take_photos
@@ -41,26 +42,26 @@ from dior_rt.training.fit import Plan, fit, fit_lora
 from dior_rt.training.network import LORA, WEIGHTS, Config, load_network
 from dior_rt.training.stage2 import Scene, fit_stage2, load_scenes
 
-Told = Callable[[str, int, float], None]  # which training, step, running loss
+TrainingProgress = Callable[[str, int, float], None]  # the name of the training, the step, the running loss
 
 PAIRS: Final = ("replace", "change")  # of every held-out view
-STILL: Final = ("keep",)  # what the brush visits: pictures under their own light
+STILL: Final = ("keep",)  # pictures for the brush: nothing changes
 GRID: Final = GridRule(cells=1024, multiple=4)
 GRIDS: Final = ((32, 32), (28, 40), (40, 28))
-SCHEDULE: Final = ShiftSchedule(Plan.shift)  # as flow times are drawn in training
-EXAMPLES: Final = 3  # of a row, for the contact sheet
+SCHEDULE: Final = ShiftSchedule(Plan.shift)  # flow times as in training
+EXAMPLES: Final = 3  # per row, for the contact sheet
 
 LAMPS: Final = "strokes of the Lumi map"
-AHEAD: Final = "PSNR less the first row's"
-CONTROL: Final = "The light is cut from the true map of the target, of the row's kind or the Lumi map."
+AHEAD: Final = "PSNR minus the first row's"
+CONTROL: Final = "The control is cut from the target's true map, either of the row's kind or the Lumi map."
 BOUND: Final = "The quotient knows both true maps, of source and target."
-BRUSH: Final = "White dabs at 0.25 to 4 times the light that a map says is there."
-DABS: Final = {"on its own map": None, "on the Lumi map": LUMI}  # of which kind
+BRUSH: Final = "White dabs at 0.25 to 4 times the light in a map."
+DABS: Final = {"on its own map": None, "on the Lumi map": LUMI}  # the kind of map
 
 
 @dataclass(frozen=True)
 class Condition:
-    """A row: its name, the kind of map (see `maps`) that is its control, and whether stage 2 sees photos."""
+    """A row: its name, the kind of map for its control (see `maps`), and whether stage 2 sees photos."""
 
     name: str
     kind: str
@@ -78,8 +79,10 @@ CONDITIONS: Final = (
 
 @dataclass(frozen=True)
 class Budget:
-    """What every row may spend: a small network, for grids of half the usual side. rank: of the LoRA.
-    scenes: how many stand in for real ones."""
+    """The budget of every row: a small network on grids of half the usual side.
+
+    rank: of the LoRA. scenes: how many scenes stand in for real ones.
+    """
 
     config: Config = field(default_factory=lambda: Config(96, 3, 4, patch=4, fine=8, half=32, quarter=64))
     stage1: Plan = field(default_factory=lambda: Plan(steps=400, batch=8, warmup=30, average=30, grids=GRIDS))
@@ -96,12 +99,12 @@ def ablate(
     renders: Path,
     out: Path,
     budget: Budget = Budget(),
-    progress: Told | None = None,
+    progress: TrainingProgress | None = None,
 ) -> tuple[Evaluation, list[Example]]:
-    """Train every row into the folder `out` and judge it; what is trained already is kept.
+    """Train every row into the folder `out` and judge it. Rows that are already trained are kept.
 
-    maps, held_out: what `render_maps` made of renders to train on and of others. renders: what `maps` was
-    made of; its other scenes stand in for photos. Raises InputError for what cannot be used.
+    maps, held_out: the output of `render_maps` for training and for judging. renders: the renders of
+    `maps`; the other scenes in it stand in for photos. Raises InputError for unusable input.
     """
     photos = load_scenes(take_photos(renders, out / "photos", without=maps / LUMI, scenes=budget.scenes))
     networks = {row: train(row, maps / row.kind, photos, out, budget, progress) for row in CONDITIONS}
@@ -114,14 +117,14 @@ def train(
     photos: list[Scene],
     out: Path,
     budget: Budget,
-    progress: Told | None = None,
+    progress: TrainingProgress | None = None,
 ) -> Network:
-    """A row's network, stage 1 and LoRA. Rows of the same map share their stage 1."""
+    """Return a row's network after stage 1 and the LoRA. Rows of the same map share their stage 1."""
     stage1 = out / f"stage1-{row.kind}"
     lora = out / f"{'stage2' if row.stage2 else 'lora'}-{row.kind}"
-    tell = progress or (lambda training, step, loss: None)
-    fit(views, stage1, budget.config, budget.stage1, partial(tell, f"{row.kind}, stage 1"))
-    show = partial(tell, f"{row.kind}, {lora.name}")
+    show_training = progress or (lambda training, step, loss: None)
+    fit(views, stage1, budget.config, budget.stage1, partial(show_training, f"{row.kind}, stage 1"))
+    show = partial(show_training, f"{row.kind}, {lora.name}")
     if row.stage2:
         make = partial(MiniLora, stage1 / WEIGHTS, budget.rank, lora)
         fit_stage2(make, views, photos, lora, budget.lora, progress=show)
@@ -132,7 +135,7 @@ def train(
 
 @dataclass(frozen=True)
 class Walk:
-    """How the flow is walked: by Euler's steps, from noise of a strength; from none to the mean answer."""
+    """How to walk the flow: the number of Euler steps and the strength of the noise; 0 leads to the mean."""
 
     steps: int = 1
     noise: float = 0.0
@@ -148,17 +151,17 @@ class Network:
 
     @staticmethod
     def load(folder: Path) -> Network:
-        """A base with its LoRA, as training leaves them."""
+        """Load a base with its LoRA from a training folder."""
         base = load_network(folder / WEIGHTS)
         return Network(PeftModel.from_pretrained(base, str(folder / LORA)).eval())  # type: ignore[arg-type]
 
     def relight(self, photo: Photo, strokes: Strokes) -> Photo:
-        """The photo (H, W, 3) under strokes of its size."""
+        """Return the photo (H, W, 3) under strokes of its size."""
         return OPS.transfer(photo, *self.light(photo, strokes))
 
     @torch.no_grad()
     def light(self, photo: Photo, strokes: Strokes) -> tuple[Raster, Raster]:
-        """The photo on the light grid, and relit; (h, w, 3), linear."""
+        """Return the photo on the light grid and the relit grid, (h, w, 3), linear."""
         grid = GRID.shape(*photo.shape[:2])
         source = OPS.reduce_photo(photo, grid)
         encoded = np.clip(linear_to_srgb(source), 0, 1).astype(np.float32)
@@ -171,37 +174,39 @@ class Network:
 
         noise = np.float32(self.walk.noise) * draw_noise(self.walk.seed, condition["photo"].shape)
         *_, end = sample(velocity, noise, SCHEDULE.sigmas(self.walk.steps))
-        relit = np.clip(condition["photo"] + end.x / mini.RELIT_SCALE, 0, 1)[0].transpose(1, 2, 0)
+        relit = relit_from_x0(end.x, condition["photo"])[0].transpose(1, 2, 0)
         return source, srgb_to_linear(np.ascontiguousarray(relit)).astype(np.float32)
 
 
-Scores = dict[str, list[float]]  # by measure, one a picture
+Scores = dict[str, list[float]]  # by measure, one per picture
 
 
 def judge(networks: Mapping[Condition, Network], held_out: Path) -> tuple[Evaluation, list[Example]]:
-    """The rows over held-out views: how near the truth they come, and how they follow the brush.
+    """Judge the rows on held-out views: the error to the truth, and the response to the brush.
 
-    networks: what the first row scores, the others are compared with, picture by picture. The examples are
-    of each row's strokes. Raises InputError where the views of different maps are not of the same pictures.
+    networks: the others are compared with the first row, per picture. The examples show each row under
+    strokes. Raises InputError if the views of different maps show different pictures.
     """
     lamps = tasks(held_out, LUMI, PAIRS)
     copied = Row("copy", "", figures(score([task.source for task in lamps], lamps)), None)
     rows, bounds, brush, examples = [], [copied], [], []
     first: dict[str, Scores] = {}
     for row, network in networks.items():
-        own = tasks(held_out, row.kind, PAIRS)
-        check_same_pictures(own, lamps)
-        for control, strokes in controls(own, lamps).items():
-            relit = [network.relight(task.source, drawn) for task, drawn in zip(own, strokes, strict=True)]
-            scores = score(relit, own)
+        row_tasks = tasks(held_out, row.kind, PAIRS)
+        check_same_pictures(row_tasks, lamps)
+        for control, strokes in controls(row_tasks, lamps).items():
+            relit = [
+                network.relight(task.source, drawn) for task, drawn in zip(row_tasks, strokes, strict=True)
+            ]
+            scores = score(relit, row_tasks)
             ahead = np.subtract(scores["PSNR"], first.setdefault(control, scores)["PSNR"]).tolist()
             rows.append(Row(row.name, control, figures({**scores, AHEAD: ahead}), None))
             if control == "strokes":
-                named = [replace(task, name=f"{task.name}, {row.name}") for task in own]
+                named = [replace(task, name=f"{task.name}, {row.name}") for task in row_tasks]
                 examples += [Example(*each) for each in zip(named, strokes, relit, strict=True)][:EXAMPLES]
         if row.stage2:
-            known = figures(score(quotients(own), own))
-            bounds.append(Row("quotient", f"both of kind {row.kind}", known, None))
+            quotient_figures = figures(score(quotients(row_tasks), row_tasks))
+            bounds.append(Row("quotient", f"both of kind {row.kind}", quotient_figures, None))
         for control, kind in DABS.items():
             still = tasks(held_out, kind or row.kind, STILL, seed=3)
             brush.append(Row(row.name, control, figures(follow(network, still)), None))
@@ -215,29 +220,29 @@ def judge(networks: Mapping[Condition, Network], held_out: Path) -> tuple[Evalua
 
 
 def tasks(held_out: Path, kind: str, pairs: Sequence[str], seed: int = 1) -> list[Task]:
-    """Pairs of the views under a kind of map. Raises InputError where there are none."""
+    """Return pairs of the views under a kind of map. Raises InputError if there are none."""
     found = benchmarks(held_out / kind, pairs, seed)
     if not found:
         raise InputError(f"There are no views in {held_out / kind}; make them with `dior-rt train maps`.")
     return [task for benchmark in found for task in benchmark]
 
 
-def check_same_pictures(own: Sequence[Task], others: Sequence[Task]) -> None:
-    """Raise InputError where tasks differ in more than their maps."""
-    for one, other in zip(own, others, strict=True):
+def check_same_pictures(row_tasks: Sequence[Task], others: Sequence[Task]) -> None:
+    """Raise InputError if tasks differ in more than their maps."""
+    for one, other in zip(row_tasks, others, strict=True):
         same = one.name == other.name and np.array_equal(one.source, other.source)
         if not (same and np.array_equal(one.truth, other.truth)):
-            raise InputError(f"The maps of {other.name} are not of the same pictures; render them anew.")
+            raise InputError(f"The maps of {other.name} show different pictures; render the maps again.")
 
 
-def controls(own: Sequence[Task], lamps: Sequence[Task]) -> dict[str, list[Strokes]]:
-    """What drives a row, by name: its own map whole, strokes cut out of it, and out of the Lumi map."""
-    drawn: dict[str, list[Strokes]] = {name: [task.control(name) for task in own] for name in DRAWN}
+def controls(row_tasks: Sequence[Task], lamps: Sequence[Task]) -> dict[str, list[Strokes]]:
+    """Return the control of a row by name: its full map, strokes cut from it, and strokes of the Lumi map."""
+    drawn: dict[str, list[Strokes]] = {name: [task.control(name) for task in row_tasks] for name in DRAWN}
     return {**drawn, LAMPS: [task.control("strokes") for task in lamps]}
 
 
 def score(pictures: Sequence[Photo], tasks: Sequence[Task]) -> Scores:
-    """Every measure of `eval`, picture by picture."""
+    """Return every measure of `eval` for each picture."""
     return {
         name: [measure(picture, task.truth) for picture, task in zip(pictures, tasks, strict=True)]
         for name, measure in MEASURES.items()
@@ -245,12 +250,12 @@ def score(pictures: Sequence[Photo], tasks: Sequence[Task]) -> Scores:
 
 
 def figures(scores: Scores) -> dict[str, Figure]:
-    """Means and their intervals."""
+    """Return the means with their intervals."""
     return {name: Figure.of(values) for name, values in scores.items()}
 
 
 def quotients(tasks: Sequence[Task]) -> list[Photo]:
-    """What both true maps say of the pictures, with nothing learnt."""
+    """Return the quotients of the true maps, an oracle without learning."""
     pictures = []
     for task in tasks:
         assert task.source_lumi is not None and task.target_lumi is not None
@@ -259,6 +264,6 @@ def quotients(tasks: Sequence[Task]) -> list[Photo]:
 
 
 def follow(network: Network, still: Sequence[Task]) -> Scores:
-    """How the picture follows a white dab, dab by dab; see `control.Response`."""
+    """Return how the picture follows each white dab; see `control.Response`."""
     answers = [response(network.relight, [task]) for task in still]
     return {name: [getattr(answer, name) for answer in answers] for name in ("slope", "monotonic", "leakage")}

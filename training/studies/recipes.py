@@ -1,12 +1,12 @@
-"""The recipes: how mini may be trained and sampled, by short runs side by side at equal cost.
+"""The recipes: compare ways to train and sample mini, by short runs at equal cost.
 
-Every row starts from the same seed, sees the same batches in the same order and spends as many
-floating-point operations as `what ships`; so a larger network, or one that asks another, takes fewer steps.
-The rows differ in what the flow starts from, in what comes before it, or in the network's shape.
+Every row starts from the same seed, sees the same batches in the same order and spends as many floating-point
+operations as `what ships`. So a larger network, or one that evaluates another, takes fewer steps. The rows
+differ in the start of the flow, in what is trained before, or in the network's shape.
 
-A flow from N(0, 1) to x0 and one from N(c, s^2) have, after a change of clock and scale, the same states:
-what a narrow prior or an estimate in the middle changes is where training spends its draws, and what the
-network is told.
+After a change of clock and scale, a flow from N(0, 1) to x0 and one from N(c, s^2) have the same states. So
+a narrow prior, or an estimate as its mean, changes only the distribution of training draws and the inputs
+of the network.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from dior_rt.training.network import WEIGHTS, Config, Mini, load_network, save_n
 from dior_rt.training.studies.ablation import AHEAD, PAIRS, STILL, Budget, Network, Walk, figures, follow
 from dior_rt.training.studies.variants import AboutEstimate, sever
 
-EXAMPLES: Final = 2  # of a row, for the contact sheet
+EXAMPLES: Final = 2  # per row, for the contact sheet
 CONTROL: Final = "The light is cut from the true Lumi map of the target."
 BRUSH: Final = (
     "One step without noise. White dabs at 0.25 to 4 times the light that is there; borders: differences of "
@@ -49,21 +49,27 @@ ONCE: Final = Walk()
 
 
 def walks(noise: float) -> tuple[Walk, ...]:
-    """One step, and several from noise. A single step is the same with noise: at sigma = 1 the network does
-    not look at the state."""
+    """Return one step without noise, and several steps from noise.
+
+    A single step is the same with noise, because at sigma = 1 the network ignores the state.
+    """
     return ONCE, Walk(4, noise), Walk(20, noise)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A row. silent, always_noise, noise: of its `Plan`. share: of the cost, its own part. after: what is
-    trained before, and gone on from; about: it stays as it is, and the flow is about its answer.
-    patch, widen: the network's patch, and how many times as wide it is. blended: whether its convolutions
-    blend the transformer's answer across the patches' borders. walks: how its flow is judged.
+    """A row.
+
+    noiseless, always_noise, noise: as in `Plan`. share: its part of the cost.
+    after: the recipe that is trained before and continued. about: `after` stays frozen, and the flow models
+    the difference to its answer.
+    patch, widen: the network's patch, and the factor of its width.
+    blended: whether convolutions blend the transformer's answer across the borders of patches.
+    walks: how its flow is sampled when it is judged.
     """
 
     name: str
-    silent: float = Plan.silent
+    noiseless: float = Plan.noiseless
     always_noise: float = Plan.always_noise
     noise: float = Plan.noise
     share: float = 1.0
@@ -82,18 +88,20 @@ class Recipe:
         return replace(small, patch=self.patch, width=self.widen * small.width)
 
 
-HALF: Final = Recipe("half a regression", silent=1, always_noise=1, share=0.5)
+HALF: Final = Recipe("half a regression", noiseless=1, always_noise=1, share=0.5)
 RECIPES: Final = (
     Recipe("what ships", walks=(*walks(1), Walk(20))),
-    Recipe("noise start", silent=0, always_noise=0, walks=walks(1)),
-    Recipe("noise start, sigma mostly 1", silent=0, walks=walks(1)),
-    Recipe("regression", silent=1, always_noise=1),
-    Recipe("regression, then noise start", silent=0, always_noise=0, share=0.5, after=HALF, walks=walks(1)),
-    Recipe("bridge from the photo, noise 0.25", silent=0, always_noise=0, noise=0.25, walks=walks(0.25)),
-    Recipe("bridge from the photo, no noise", silent=1, always_noise=0, walks=(ONCE, Walk(4), Walk(20))),
+    Recipe("noise start", noiseless=0, always_noise=0, walks=walks(1)),
+    Recipe("noise start, sigma mostly 1", noiseless=0, walks=walks(1)),
+    Recipe("regression", noiseless=1, always_noise=1),
+    Recipe(
+        "regression, then noise start", noiseless=0, always_noise=0, share=0.5, after=HALF, walks=walks(1)
+    ),
+    Recipe("bridge from the photo, noise 0.25", noiseless=0, always_noise=0, noise=0.25, walks=walks(0.25)),
+    Recipe("bridge from the photo, no noise", noiseless=1, always_noise=0, walks=(ONCE, Walk(4), Walk(20))),
     Recipe(
         "estimate, then a flow about it",
-        silent=0,
+        noiseless=0,
         always_noise=0,
         share=0.5,
         after=HALF,
@@ -118,36 +126,36 @@ def study(
     recipes: Sequence[Recipe] = RECIPES,
     progress: Progress | None = None,
 ) -> tuple[Evaluation, list[Example]]:
-    """Train every row into the folder `out` and judge it over held-out views; what is trained is kept.
+    """Train every row into the folder `out` and judge it on held-out views. Trained rows are kept.
 
-    plan: of the first row, and but for steps and noise of all. progress: told the steps of all rows.
-    Raises InputError for what cannot be used.
+    plan: of the first row; the other rows differ in steps and noise. progress: called with the steps of all
+    rows. Raises InputError for unusable input.
     """
     tasks, still = pairs(held_out, PAIRS, seed=1), pairs(held_out, STILL, seed=3)
     batches = Shared(iter(Batches(load_views(renders), plan.batch, plan.seed, grids=plan.grids)))
     plans = at_equal_cost(plan, small, recipes)
     trained: dict[Recipe, nn.Module] = {}
-    before = 0  # steps of the rows that are trained
-    for recipe, own in plans.items():
-        tell = None if progress is None else partial(_told, progress, before)
-        trained[recipe] = train(recipe, own, small, trained, batches.after(plans, recipe), out, tell)
-        before += own.steps
+    before = 0  # steps of the rows before this one
+    for recipe, row_plan in plans.items():
+        show = None if progress is None else partial(_show_total, progress, before)
+        trained[recipe] = train(recipe, row_plan, small, trained, batches.after(plans, recipe), out, show)
+        before += row_plan.steps
     rows = {recipe: trained[recipe] for recipe in recipes}
     costs = {recipe: cost(recipe, plans, small) for recipe in recipes}
     return judge(rows, costs, tasks, still)
 
 
 def total_steps(plan: Plan = PLAN, small: Config = SMALL, recipes: Sequence[Recipe] = RECIPES) -> int:
-    """Of all rows, and of what is trained before them."""
-    return sum(own.steps for own in at_equal_cost(plan, small, recipes).values())
+    """Return the steps of all rows and of the recipes trained before them."""
+    return sum(row_plan.steps for row_plan in at_equal_cost(plan, small, recipes).values())
 
 
-def _told(progress: Progress, before: int, step: int, loss: float) -> None:
+def _show_total(progress: Progress, before: int, step: int, loss: float) -> None:
     progress(before + step, loss)
 
 
 def pairs(held_out: Path, kinds: Sequence[str], seed: int) -> list[Task]:
-    """Pairs of the views. Raises InputError where there are none."""
+    """Return pairs of the views. Raises InputError if there are none."""
     found = benchmarks(held_out, kinds, seed)
     if not found:
         raise InputError(
@@ -157,14 +165,14 @@ def pairs(held_out: Path, kinds: Sequence[str], seed: int) -> list[Task]:
 
 
 def at_equal_cost(plan: Plan, small: Config, recipes: Sequence[Recipe]) -> dict[Recipe, Plan]:
-    """What is trained, in an order in which it can be, and for so long that all rows cost the same."""
+    """Return the plan of each recipe, in the order of training, such that all rows cost the same."""
     ordered = dict.fromkeys(each for recipe in recipes for each in (recipe.after, recipe) if each)
     whole = plan.steps * step_cost(Mini(small), plan)
     return {
         recipe: replace(
             plan,
             steps=max(round(recipe.share * whole / step_cost(_blank(recipe, small), plan)), 1),
-            silent=recipe.silent,
+            noiseless=recipe.noiseless,
             always_noise=recipe.always_noise,
             noise=recipe.noise,
         )
@@ -173,28 +181,28 @@ def at_equal_cost(plan: Plan, small: Config, recipes: Sequence[Recipe]) -> dict[
 
 
 def step_cost(network: nn.Module, plan: Plan) -> int:
-    """Floating-point operations of a training step's products and convolutions, there and back."""
+    """Return the operations of a training step's products and convolutions, forward and backward."""
     count, (height, width) = plan.batch, plan.grids[0]
     planes = torch.zeros(count, 3, height, width)
     batch = {name: planes for name in ("photo", "light", "x0", "own")}
     batch |= {"mask": planes[:, :1], "mode": torch.zeros(count, dtype=torch.int64)}
     with FlopCounterMode(display=False) as counted:
-        flow_loss(network, batch, torch.ones(count), planes, plan.own).backward()
+        flow_loss(network, batch, torch.ones(count), planes, plan.source_weight).backward()
     return int(counted.get_total_flops())
 
 
 def cost(recipe: Recipe, plans: Mapping[Recipe, Plan], small: Config) -> Cost:
-    """Of a row, with what was trained before it."""
-    own, network = plans[recipe], _blank(recipe, small)
+    """Return the cost of a row, including the recipe trained before it."""
+    row_plan, network = plans[recipe], _blank(recipe, small)
     earlier = cost(recipe.after, plans, small) if recipe.after else Cost(0, 0, 0)
     weights = sum(weight.numel() for weight in network.parameters())
-    flops = own.steps * step_cost(network, own)
-    return Cost(earlier.samples + own.steps * own.batch, weights, earlier.flops + flops)
+    flops = row_plan.steps * step_cost(network, row_plan)
+    return Cost(earlier.samples + row_plan.steps * row_plan.batch, weights, earlier.flops + flops)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """weights: of all networks that an answer needs. flops: of training."""
+    """weights: of all networks that an answer needs. flops: operations of training."""
 
     samples: int
     weights: int
@@ -205,13 +213,13 @@ class Cost:
 
 
 class Shared:
-    """Batches that are drawn once, as far as some row needs them, for all rows."""
+    """Batches that are drawn once and shared by all rows."""
 
     def __init__(self, source: Iterator[Batch]) -> None:
         self.source, self.drawn = source, list[Batch]()
 
     def after(self, plans: Mapping[Recipe, Plan], recipe: Recipe) -> Stream:
-        """A row's, which begin where those of what was trained before it end."""
+        """Return a row's batches, which begin where those of the recipe before it end."""
         first = plans[recipe.after].steps if recipe.after else 0
         end = first + plans[recipe].steps
 
@@ -243,7 +251,7 @@ def train(
     out: Path,
     progress: Progress | None,
 ) -> nn.Module:
-    """A recipe's network with its averaged weights. trained: what it may go on from."""
+    """Return a recipe's network with averaged weights. trained: the networks it may continue."""
     torch.manual_seed(plan.seed)
     folder, base = out / recipe.folder, trained[recipe.after] if recipe.after else None
     network = _network(recipe, small, base)
@@ -259,7 +267,7 @@ def train(
 
 
 def _network(recipe: Recipe, small: Config, base: nn.Module | None) -> nn.Module:
-    """What a recipe's training begins with."""
+    """Return the network with which a recipe's training begins."""
     network = deepcopy(base) if base else Mini(recipe.config(small))
     if not recipe.blended:
         assert isinstance(network, Mini)
@@ -268,7 +276,7 @@ def _network(recipe: Recipe, small: Config, base: nn.Module | None) -> nn.Module
 
 
 def _blank(recipe: Recipe, small: Config) -> nn.Module:
-    """A network of the recipe's shape."""
+    """Return a new network of the recipe's shape."""
     return _network(recipe, small, Mini(recipe.config(small)) if recipe.after else None)
 
 
@@ -278,10 +286,10 @@ def judge(
     tasks: Sequence[Task],
     still: Sequence[Task],
 ) -> tuple[Evaluation, list[Example]]:
-    """The rows over pairs of held-out views, and under the brush on views that keep their light.
+    """Judge the rows on pairs of held-out views, and with the brush on views that keep their light.
 
-    What the first row answers in one step is what all are compared with, picture by picture. The examples
-    are of each row's strokes in one step.
+    All rows are compared with the first row in one step, per picture. The examples show each row under
+    strokes in one step.
     """
     strokes = {drawn: [task.control(drawn) for task in tasks] for drawn in DRAWN}
     first: dict[str, list[float]] = {}
@@ -318,7 +326,7 @@ def judge(
 
 
 def answers(network: nn.Module, walk: Walk, tasks: Sequence[Task], strokes: Sequence[Strokes]) -> list[Photo]:
-    """Every task's source under its strokes; each from noise of its own, the same for all rows."""
+    """Relight every task's source under its strokes. Each task has its own noise, the same for all rows."""
     return [
         Network(network, replace(walk, seed=task.seed)).relight(task.source, drawn)
         for task, drawn in zip(tasks, strokes, strict=True)
@@ -326,12 +334,12 @@ def answers(network: nn.Module, walk: Walk, tasks: Sequence[Task], strokes: Sequ
 
 
 def borders(network: nn.Module, patch: int, task: Task, strokes: Strokes) -> float:
-    """See `border_ratio`, of the light that a picture gains under strokes."""
+    """Return `border_ratio` of the light that a picture gains under strokes."""
     source, relit = Network(network).light(task.source, strokes)
     return border_ratio(np.log((relit + E) / (source + E)), patch)
 
 
 def named(walk: Walk) -> str:
-    """How a flow is walked, in words."""
+    """Describe a walk in words."""
     steps = f"{walk.steps} step{'s' if walk.steps > 1 else ''}"
     return f"{steps} from noise {walk.noise:g}" if walk.noise else f"{steps} without noise"

@@ -1,9 +1,8 @@
-"""How a photo lies in the picture that the model sees, so that the result comes back aligned to the pixel.
+"""Place a photo in the picture that the model sees, so that the result is aligned to the pixel.
 
-The model wants sides that are multiples of 32 and some 1024 x 1024 pixels. Stretching the photo to such a
-size and the result back would do, if models of this family did not answer a stretched picture with one that
-is shifted and zoomed. So the photo keeps its shape, as the content of a canvas that is filled up with the
-content's mirror image; the result is cut out of the same place.
+The model needs sides that are multiples of 32 and about 1024 x 1024 pixels. Models of this family shift and
+zoom a stretched photo. So the photo keeps its shape as the content of a canvas. The rest of the canvas is
+filled with the content's mirror image, and the result is cut from the same place.
 """
 
 from __future__ import annotations
@@ -17,14 +16,15 @@ from PIL import Image
 
 
 def fit_area(area: int, height: int, width: int, multiple: int) -> tuple[int, int]:
-    """(rows, columns): multiples of `multiple`, the product about `area`, the ratio about height : width."""
+    """Return (rows, columns): multiples of `multiple`, with about `area` pixels and the ratio height :
+    width."""
     columns = math.sqrt(area * (width / height))
     rows = columns / (width / height)
     return max(1, round(rows / multiple)) * multiple, max(1, round(columns / multiple)) * multiple
 
 
 def fit_content(area: int, height: int, width: int, multiple: int) -> tuple[int, int]:
-    """(rows, columns) of a photo's content: of its shape, as large as the size of `fit_area` allows."""
+    """Return (rows, columns) of the content: the photo's shape, as large as the size of `fit_area` allows."""
     rows, columns = fit_area(area, height, width, multiple)
     scale = min(rows / height, columns / width)
     return max(1, round(height * scale)), max(1, round(width * scale))
@@ -32,7 +32,7 @@ def fit_content(area: int, height: int, width: int, multiple: int) -> tuple[int,
 
 @dataclass(frozen=True)
 class Frame:
-    """A canvas, and the content in the middle of it: (rows, columns) each, and the content's corner."""
+    """A canvas with the content in its middle: (rows, columns) of each, and the content's corner."""
 
     canvas: tuple[int, int]
     content: tuple[int, int]
@@ -40,7 +40,7 @@ class Frame:
 
     @classmethod
     def around(cls, content: tuple[int, int], multiple: int) -> Frame:
-        """The smallest canvas whose sides are multiples of `multiple`."""
+        """Return the smallest canvas whose sides are multiples of `multiple`."""
         rows, columns = (-(-side // multiple) * multiple for side in content)
         return cls((rows, columns), content, ((rows - content[0]) // 2, (columns - content[1]) // 2))
 
@@ -57,9 +57,9 @@ class Frame:
 
 
 def shrink(pixels: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
-    """A picture (h, w, 3), sRGB, uint8, uint16 or float32, brought to a size by Lanczos; 0..1.
+    """Resize an sRGB picture (h, w, 3), uint8, uint16 or float32, by Lanczos. Return it in 0..1.
 
-    8 bits stay 8 bits on the way: that is the picture that diffusers' processor shows the model.
+    8-bit pictures are resized in 8 bits, as diffusers' processor does.
     """
     if pixels.dtype == np.uint8:
         return resize(pixels, size, Image.Resampling.LANCZOS).astype(np.float32) / np.float32(255)
@@ -68,7 +68,8 @@ def shrink(pixels: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def resize(pixels: NDArray, size: tuple[int, int], method: Image.Resampling) -> NDArray:
-    """Resize (h, w, 3), uint8 or float32, to (rows, columns) as Pillow does; to its own size, not at all."""
+    """Resize (h, w, 3), uint8 or float32, to (rows, columns) as Pillow does. The same size is returned
+    unchanged."""
     if pixels.shape[:2] == size:
         return pixels
     if pixels.dtype == np.uint8:

@@ -1,6 +1,6 @@
-"""Graphs that run one after another: as many as memory holds stay loaded, the others are loaded for each use.
+"""Run graphs one after another. As many as fit in memory stay loaded; the others are loaded for each use.
 
-So a model larger than memory runs, slowly, where one graph for all of it would fail.
+So a model larger than memory still runs, only slower.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from dior_rt.bundle import Bundle
 from dior_rt.engine import Engine, Feeds, open_engine
 
-SHARE = 0.7  # of the memory that is free, for weights; the rest is for what the layers compute
+SHARE = 0.7  # share of the free memory for weights; the rest is for activations
 
 
 class Layers:
     """The graphs of a bundle on one device, by name. Safe to use from several threads.
 
-    device, reason: what runs them, and why. memory: bytes of weights that may stay loaded.
+    device, reason: the device that runs them, and why. memory: bytes of weights that may stay loaded.
     """
 
     def __init__(
@@ -30,8 +30,7 @@ class Layers:
         threads: int | None = None,
         memory: int | None = None,
     ) -> None:
-        """Open the graph `first` on the device, which is chosen by it. memory: None takes a share of what is
-        free.
+        """Open the graph `first`, which decides on the device. memory: None takes a share of the free memory.
 
         Raises what `open_engine` raises.
         """
@@ -48,7 +47,8 @@ class Layers:
         return self.engine(name).run(feeds)
 
     def engine(self, name: str) -> Engine:
-        """The graph's engine. Hold it no longer than needed: it may be all that keeps its weights."""
+        """Return the graph's engine. Do not keep it longer than needed, because it keeps the weights in
+        memory."""
         with self._lock:
             if name in self._kept:
                 return self._kept[name]
@@ -60,13 +60,13 @@ class Layers:
             return engine
 
     def size(self, name: str) -> int:
-        """Bytes of the graph and its weights on disk."""
+        """Return the bytes of the graph and its weights on disk."""
         path = self._bundle.path(name)
         return sum(file.stat().st_size for file in (path, path.with_suffix(".data")) if file.is_file())
 
 
 def _free_memory() -> float:
-    """Bytes that can be had without swapping; infinite where the system does not say."""
+    """Return the bytes available without swapping, or infinity if the system does not report them."""
     try:
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):

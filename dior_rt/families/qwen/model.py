@@ -1,9 +1,9 @@
-"""Qwen: Qwen-Image-Edit with a LoRA that relights. It paints the whole picture, of some 1024 x 1024 pixels.
+"""Qwen: Qwen-Image-Edit with a LoRA that relights. It paints the full picture of about 1024 x 1024 pixels.
 
-The photo and the Lumi map of the strokes go in twice: through the autoencoder, as tokens beside those being
-denoised, and through the vision-language model that reads the prompt. Data variable x0 of the flow: the
-painted picture's latents, normalised, in tokens of 2 x 2; what is painted is the relit photo, or its Lumi
-map.
+The model sees the photo and the Lumi map of the strokes twice: through the autoencoder, as tokens beside
+those being denoised, and through the vision-language model that reads the prompt. The data variable x0 of
+the flow is the normalised latents of the painted picture, in tokens of 2 x 2. The painted picture is the
+relit photo or its Lumi map.
 """
 
 from __future__ import annotations
@@ -20,28 +20,29 @@ from PIL import Image
 from dior_rt.bundle import Bundle
 from dior_rt.errors import BundleError, InputError
 from dior_rt.families import Mode
-from dior_rt.families.qwen.frame import Frame, fit_content, resize
+from dior_rt.families.qwen.frame import Frame, fit_content, resize, shrink
 from dior_rt.families.qwen.layers import Layers
 from dior_rt.families.qwen.prompt import Features, PromptEncoder
 from dior_rt.families.qwen.rope import joint_places, turns
-from dior_rt.families.qwen.settings import LUMI_SCALE, MODULATION, PROMPTS, read_settings
+from dior_rt.families.qwen.settings import MODULATION, PROMPTS, read_settings
 from dior_rt.families.qwen.vae import decode_tiled, encode_tiled
 from dior_rt.flow.sampler import Array, Velocity, guide
 from dior_rt.flow.schedule import DynamicShiftSchedule
-from dior_rt.kernels import Strokes
+from dior_rt.kernels import Ops, Strokes
+from dior_rt.light import decode_small, draw_lumi, pack_patches, undraw_lumi, unpack_patches
 
 NEGATIVE: Final[dict[Mode, str]] = {"relight": "relight_negative", "estimate": "estimate_negative"}
 SAME_SIGMA: Final = 1e-6
-MUCH_SMALLER: Final = 1.2  # what is nearer to the model's size is seen as it is
+MUCH_SMALLER: Final = 1.2  # pictures closer to the model's size are not enlarged
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What the network sees besides x and sigma.
+    """The inputs of the network besides x and sigma.
 
-    raster: of the photo; frame: where it lies, enlarged where it is small. references: the pictures' tokens
-    (I, C). sizes: (rows, columns) of the tokens being denoised, then of each picture. features: of each
-    picture, for the prompts that speak of them.
+    raster: of the photo. frame: its place on the canvas, enlarged if it is small. references: the pictures'
+    tokens (I, C). sizes: (rows, columns) of the tokens being denoised, then of each picture. features: of
+    each picture, for the prompts that refer to them.
     """
 
     mode: Mode
@@ -63,10 +64,11 @@ class Qwen:
         memory: int | None = None,
         area: int | None = None,
     ) -> None:
-        """memory: bytes of weights that may stay loaded; None takes most of what is free. The rest is read
-        again at each step. area: pixels of the picture that is painted; None takes the model's own.
+        """Load the bundle.
 
-        Raises BundleError for a bundle that is no complete qwen, and what `open_engine` raises.
+        memory: bytes of weights that may stay loaded; None takes most of the free memory. The other weights
+        are read again at each step. area: pixels of the painted picture; None takes the model's. Raises
+        BundleError if the bundle is no complete qwen, and what `open_engine` raises.
         """
         if bundle.manifest.family != "qwen":
             raise BundleError(f"{bundle.folder} is no bundle of the family qwen.")
@@ -81,6 +83,10 @@ class Qwen:
     def raster(self, height: int, width: int) -> tuple[int, int]:
         content = fit_content(self.area, height, width, self.settings.multiple)
         return content if content[0] <= height else (height, width)
+
+    def reduce_photo(self, pixels: NDArray, raster: tuple[int, int], ops: Ops) -> tuple[Array, Array]:
+        seen = shrink(pixels, raster)  # as diffusers does, because the model was trained on such pictures
+        return decode_small(seen), seen
 
     def encode(self, photo: Array, strokes: Strokes | None, mode: Mode) -> Condition:
         raster = (photo.shape[0], photo.shape[1])
@@ -101,12 +107,13 @@ class Qwen:
         return rows * columns, condition.references.shape[1]
 
     def sigmas(self, steps: int, condition: Condition) -> Array:
-        """As `Family.sigmas`; InputError where the bundle is for another number of steps."""
+        """See `Family.sigmas`. Raises InputError if the bundle is for another number of steps."""
         fixed = self.settings.fixed_sigmas
         if fixed:
             if steps != len(fixed):
                 raise InputError(
-                    f"This model was exported for {len(fixed)} steps, not {steps}; export it with free steps."
+                    f"This model was exported for {len(fixed)} steps, not {steps}; "
+                    "export it with --free-steps."
                 )
             return np.array([*fixed, 0], np.float32)
         if isinstance(self._schedule, DynamicShiftSchedule):
@@ -114,9 +121,9 @@ class Qwen:
         return self._schedule.sigmas(steps)
 
     def velocity(self, condition: Condition, sigmas: Array, guidance: float) -> Velocity:
-        """As `Family.velocity`; the null is the negative prompt, with the same pictures.
+        """See `Family.velocity`. The null branch is the negative prompt with the same pictures.
 
-        What guidance makes of the two is brought back, token by token, to the norm of the condition alone.
+        The guided velocity is rescaled, token by token, to the norm of the conditional one.
         """
         modulation = self.modulation(sigmas[:-1])
         steps = {sigma: step for step, sigma in enumerate(sigmas[:-1].tolist())}
@@ -138,10 +145,10 @@ class Qwen:
         return self.undraw(self.paint(x0, condition))
 
     def predict(self, x: Array, condition: Condition, texts: Sequence[Array], rows: Array) -> list[Array]:
-        """The velocity of x (tokens, C) under each of the texts.
+        """Return the velocity of x (tokens, C) under each of the texts.
 
-        rows: the modulation (1 or 2, 12 layers + 2, D), at sigma and, for the references, at 0. Each layer is
-        used for all texts before the next, so that one that has to be loaded is loaded once.
+        rows: the modulation (1 or 2, 12 layers + 2, D), at sigma and, for the references, at 0. Each layer
+        runs for all texts before the next one, so that a layer is loaded once at most.
         """
         latents = np.concatenate([x, condition.references])
         states = []
@@ -164,46 +171,45 @@ class Qwen:
         return [self._head(state["image"][: len(x)], last) for state in states]
 
     def paint(self, x0: Array, condition: Condition) -> Array:
-        """The state (tokens, C) -> the picture on the photo's raster (h, w, 3), sRGB-encoded 0..1."""
-        latents = unpack(x0, condition.sizes[0], self.settings.patch)
+        """Return the picture of a state (tokens, C) on the photo's raster (h, w, 3), sRGB-encoded 0..1."""
+        latents = unpack_patches(x0, condition.sizes[0], self.settings.patch)
         pixels = decode_tiled(self._decode, latents, self.settings.factor)
         content = condition.frame.crop((pixels[0].transpose(1, 2, 0) + 1) / 2)
         small = resize(content, condition.raster, Image.Resampling.LANCZOS)
         return np.ascontiguousarray(small.clip(0, 1), np.float32)
 
     def draw(self, strokes: Strokes) -> NDArray[np.uint8]:
-        """Strokes as the model sees them: log(1 + 8 L) / log(1 + 8 peak), black where nothing is said."""
-        light = np.where(strokes.mask[..., None] > 0, strokes.light, 0)
-        encoded = np.log1p(LUMI_SCALE * light) / np.log1p(LUMI_SCALE * self.settings.lumi_peak)
-        return np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8)
+        """Return strokes as the picture that the model sees; unspecified light is black."""
+        return draw_lumi(strokes.light, strokes.mask, self.settings.lumi_peak)
 
     def undraw(self, picture: Array) -> Array:
-        """A picture 0..1 of a Lumi map -> linear light >= 0: the inverse of `draw`."""
-        span = np.float32(np.log1p(LUMI_SCALE * self.settings.lumi_peak))
-        return np.expm1(picture * span) / np.float32(LUMI_SCALE)
+        """Return linear light >= 0 from a picture 0..1 of a Lumi map: the inverse of `draw`."""
+        return undraw_lumi(picture, self.settings.lumi_peak)
 
     def to_tokens(self, picture: NDArray[np.uint8]) -> Array:
-        """A picture (h, w, 3), sRGB, of whole tokens -> its tokens (I, C)."""
+        """Return the tokens (I, C) of an sRGB picture (h, w, 3) whose sides are multiples of a token."""
         pixels = picture.transpose(2, 0, 1)[None].astype(np.float32) / np.float32(127.5) - 1
-        return pack(encode_tiled(self._encode, pixels, self.settings.factor), self.settings.patch)
+        return pack_patches(encode_tiled(self._encode, pixels, self.settings.factor), self.settings.patch)
 
     def turns(self, words: int, sizes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
-        """Rotary positions of the words and of all pictures' tokens, (T + I, head / 2)."""
+        """Return the rotary positions of words and of all pictures' tokens, (T + I, head / 2)."""
         return turns(joint_places(words, sizes), self.settings.axes, self.settings.theta)
 
     def modulation(self, sigmas: Array) -> Array:
-        """The modulation's rows (sigmas, 12 layers + 2, D), one more for 0 where references need it.
+        """Return the rows of modulation (sigmas, 12 layers + 2, D), plus one for 0 if references need it.
 
-        Read from the bundle's table, or computed once for a schedule.
+        They are read from the bundle's table, or computed once per schedule.
         """
         fixed = self.settings.fixed_sigmas
         if self._table is not None:
             if len(sigmas) != len(fixed) or np.abs(sigmas - np.array(fixed)).max() > SAME_SIGMA:
-                raise InputError("This model has no modulation for these sigmas; export it with free steps.")
+                raise InputError(
+                    "This model has no modulation for these sigmas; export it with --free-steps."
+                )
             return self._table
         key = sigmas.tobytes()
         if key not in self._computed:
-            self._computed = {key: self._compute_modulation(sigmas)}  # a picture or a series: one schedule
+            self._computed = {key: self._compute_modulation(sigmas)}  # a picture or a series has one schedule
         return self._computed[key]
 
     def _compute_modulation(self, sigmas: Array) -> Array:
@@ -215,7 +221,8 @@ class Qwen:
         return np.concatenate(list(rows), axis=1)
 
     def _content(self, raster: tuple[int, int]) -> tuple[int, int]:
-        """The size that a raster is seen at: its own, unless it is much smaller than the model's pictures."""
+        """Return the size at which the model sees a raster: larger if it is much smaller than the model's
+        pictures."""
         content = fit_content(self.area, *raster, self.settings.multiple)
         return content if content[0] > MUCH_SMALLER * raster[0] else raster
 
@@ -230,13 +237,13 @@ class Qwen:
         return self.layers.run("vae.decoder", {"latents": latents})["pixels"]
 
     def _text(self, prompt: str, condition: Condition) -> Array:
-        """The embeddings (T, D) of a prompt."""
+        """Return the embeddings (T, D) of a prompt."""
         if self._prompts is None:
             return self._cached[prompt]
         return self._prompts.encode(prompt, condition.features)
 
     def _read_prompts(self, bundle: Bundle) -> tuple[Mapping[str, Array], PromptEncoder | None]:
-        """The prompts' embeddings, or what computes them."""
+        """Read the prompts' embeddings, or the encoder that computes them."""
         with _readable(bundle, PROMPTS), np.load(bundle.folder / PROMPTS, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
             if self.settings.text is None:
@@ -257,30 +264,19 @@ class Qwen:
 
 
 def rescaled(v: Array, like: Array) -> Array:
-    """v with each token's norm made that of `like`; a token of norm 0 stays 0."""
+    """Return v with each token scaled to the norm of `like`. A token of norm 0 stays 0."""
     (v, _, norm), (_, largest, wanted) = _measured(v), _measured(like)
     return v / np.maximum(norm, 1) * (largest * wanted)
 
 
 def _measured(v: Array) -> tuple[Array, Array, Array]:
-    """Each token by its largest |value|, that value, and the norm of what is left: 0, or at least 1. So no
-    square overflows, and none vanishes."""
+    """Return each token divided by its largest |value|, that value, and the norm of the quotient.
+
+    The norm is 0 or at least 1, so no square overflows or vanishes.
+    """
     largest = np.abs(v).max(axis=-1, keepdims=True)
     unit = np.divide(v, largest, out=np.zeros_like(v), where=largest > 0)
     return unit, largest, np.linalg.norm(unit, axis=-1, keepdims=True)
-
-
-def pack(latents: Array, patch: int) -> Array:
-    """Latents (1, z, h, w) -> tokens (h w / patch^2, z patch^2), row by row."""
-    _, channels, rows, columns = latents.shape
-    split = latents.reshape(channels, rows // patch, patch, columns // patch, patch)
-    return np.ascontiguousarray(split.transpose(1, 3, 0, 2, 4).reshape(-1, channels * patch**2))
-
-
-def unpack(tokens: Array, size: tuple[int, int], patch: int) -> Array:
-    """The inverse of `pack`, for tokens of (rows, columns)."""
-    split = tokens.reshape(*size, -1, patch, patch).transpose(2, 0, 3, 1, 4)
-    return np.ascontiguousarray(split.reshape(1, -1, size[0] * patch, size[1] * patch))
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""From a prompt and its pictures to the embeddings that the transformer reads: Qwen2.5-VL, layer by layer."""
+"""Encode a prompt and its pictures for the transformer: Qwen2.5-VL, layer by layer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Features:
-    """What the vision tower makes of one picture: (rows * columns, D), row by row."""
+    """The vision tower's features of one picture: (rows * columns, D), row by row."""
 
     values: Array
     rows: int
@@ -29,13 +29,13 @@ class Features:
 
 
 class PromptEncoder:
-    """The prompts of a bundle. words: word id -> its embedding (D,)."""
+    """The encoder of a bundle's prompts. words: word id -> its embedding (D,)."""
 
     def __init__(self, settings: TextSettings, words: Mapping[int, Array], layers: Layers) -> None:
         self._settings, self._words, self._layers = settings, words, layers
 
     def look(self, pictures: Sequence[Picture]) -> list[Features]:
-        """The features of pictures (h, w, 3), sRGB."""
+        """Return the features of sRGB pictures (h, w, 3)."""
         vision = self._settings.vision
         seen = [patchify(vision, picture) for picture in pictures]
         grids = [grid for _, grid in seen]
@@ -58,7 +58,7 @@ class PromptEncoder:
         return [Features(part, *size) for part, size in zip(parts, sizes, strict=True)]
 
     def encode(self, prompt: str, features: Sequence[Features]) -> Array:
-        """The embeddings (T, D) of a prompt, by its name, that speaks of these pictures in this order."""
+        """Return the embeddings (T, D) of the named prompt, which refers to these pictures in this order."""
         text = self._settings
         x, places = self._sequence(text.prompts[prompt], features)
         cos, sin = section_turns(places, text.head, text.sections, text.theta)
@@ -67,10 +67,10 @@ class PromptEncoder:
         return self._layers.run("text.norm", {"x": x})["out"][text.skip :]
 
     def _sequence(self, ids: Sequence[int], features: Sequence[Features]) -> tuple[Array, NDArray[np.int64]]:
-        """Words and features in a row, and their places (tokens, 3).
+        """Return words and features in sequence, and their positions (tokens, 3).
 
-        A word is one place on from what is before it. A picture's features stand where they are in it, and
-        what follows is beyond its longer side.
+        A word is one position after its predecessor. A picture's features have their positions in the
+        picture; the next word is beyond its longer side.
         """
         parts, places, place, pictures = [], [], 0, iter(features)
         for word in ids:
@@ -89,17 +89,17 @@ class PromptEncoder:
 def section_turns(
     places: NDArray[np.int64], head: int, sections: Sequence[int], theta: float
 ) -> tuple[Array, Array]:
-    """cos and sin (tokens, head / 2) where the rates are dealt out to frame, row and column in turn."""
+    """Return cos and sin (tokens, head / 2), with the rates divided among frame, row and column."""
     axis = np.repeat(np.arange(len(sections)) % 3, sections)
     angles = places[:, axis].astype(np.float32) * rates(head, theta)
     return np.cos(angles), np.sin(angles)
 
 
 def patchify(vision: VisionSettings, picture: Picture) -> tuple[Array, tuple[int, int]]:
-    """The patches (rows * columns, 3 * frames * patch^2) of a picture (h, w, 3), and (rows, columns).
+    """Return the patches (rows * columns, 3 * frames * patch^2) of a picture (h, w, 3), and (rows, columns).
 
-    The picture is brought to about `area` by Lanczos, then to whole patches by bicubic, as the model's two
-    processors do it. Patches that will be merged stand side by side.
+    The picture is resized to about `area` by Lanczos, then to full patches by bicubic, as the model's two
+    processors do. Patches that will be merged are adjacent.
     """
     height, width = fit_area(vision.area, picture.shape[0], picture.shape[1], vision.multiple)
     picture = resize(picture, (height, width), Image.Resampling.LANCZOS)
@@ -118,7 +118,7 @@ def patchify(vision: VisionSettings, picture: Picture) -> tuple[Array, tuple[int
 
 
 def whole_patches(vision: VisionSettings, height: int, width: int) -> tuple[int, int]:
-    """The nearest size of whole merged patches whose pixels lie between the model's limits."""
+    """Return the nearest size in full merged patches within the model's limits of pixels."""
     unit = vision.patch * vision.merge
     rows, columns = round(height / unit) * unit, round(width / unit) * unit
     if rows * columns > vision.most_pixels:
@@ -131,7 +131,7 @@ def whole_patches(vision: VisionSettings, height: int, width: int) -> tuple[int,
 
 
 def patch_places(vision: VisionSettings, grid: tuple[int, int]) -> NDArray[np.int64]:
-    """(row, column) of each patch of a picture, in the order of `patchify`."""
+    """Return (row, column) of each patch of a picture, in the order of `patchify`."""
     merge = vision.merge
     places = np.moveaxis(np.mgrid[: grid[0], : grid[1]], 0, -1)
     split = places.reshape(grid[0] // merge, merge, grid[1] // merge, merge, 2)
@@ -141,7 +141,7 @@ def patch_places(vision: VisionSettings, grid: tuple[int, int]) -> NDArray[np.in
 def window_order(
     vision: VisionSettings, grids: Sequence[tuple[int, int]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The merged patches of all pictures, window by window; and of each patch, in that order, its window."""
+    """Return the order of merged patches by window, and the window of each patch in that order."""
     side = vision.window // vision.patch // vision.merge
     keys = []
     for k, (rows, columns) in enumerate(grids):
@@ -153,6 +153,6 @@ def window_order(
 
 
 def _in_order(patches: NDArray, order: NDArray[np.int64], merge: int) -> NDArray:
-    """Patches with their merged groups put in order."""
+    """Return the patches with their merged groups in the given order."""
     groups = patches.reshape(-1, merge**2, patches.shape[1])
     return np.ascontiguousarray(groups[order].reshape(patches.shape))

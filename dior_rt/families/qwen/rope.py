@@ -1,4 +1,5 @@
-"""Rotary positions: how far each pair of a head's numbers turns, as cos and sin tables (tokens, head / 2)."""
+"""Rotary positions: the rotation of each pair of a head's numbers, as cos and sin tables (tokens, head /
+2)."""
 
 from __future__ import annotations
 
@@ -11,13 +12,14 @@ Array = NDArray[np.float32]
 
 
 def rates(width: int, theta: float) -> Array:
-    """theta^(-2 i / width) for i < width / 2: radians a place (Su et al., arXiv 2104.09864)."""
+    """Return theta^(-2 i / width) for i < width / 2: radians per position (Su et al., arXiv 2104.09864)."""
     exponents = np.arange(0, width, 2, dtype=np.float32) / np.float32(width)
     return (1 / np.power(np.float32(theta), exponents)).astype(np.float32)
 
 
 def turns(places: NDArray[np.int64], widths: Sequence[int], theta: float) -> tuple[Array, Array]:
-    """cos and sin for tokens at `places` (tokens, axes); axis k turns widths[k] of a head's numbers."""
+    """Return cos and sin for tokens at `places` (tokens, axes). Axis k rotates widths[k] of a head's
+    numbers."""
     angles = [
         np.outer(places[:, k].astype(np.float32), rates(width, theta)) for k, width in enumerate(widths)
     ]
@@ -26,10 +28,10 @@ def turns(places: NDArray[np.int64], widths: Sequence[int], theta: float) -> tup
 
 
 def joint_places(text: int, pictures: Sequence[tuple[int, int]]) -> NDArray[np.int64]:
-    """Places (frame, row, column) of `text` words, then of the pictures' tokens, given as (rows, columns).
+    """Return positions (frame, row, column) of `text` words, then of the tokens of pictures (rows, columns).
 
-    Picture k is frame k, its rows and columns are counted from its middle; words follow on the diagonal,
-    beyond the edge of the largest picture.
+    Picture k is frame k, and its rows and columns are counted from its centre. Words follow on the
+    diagonal, beyond the edge of the largest picture.
     """
     first = max(max(rows // 2, columns // 2) for rows, columns in pictures)
     words = np.repeat(np.arange(first, first + text)[:, None], 3, axis=1)
@@ -41,6 +43,6 @@ def joint_places(text: int, pictures: Sequence[tuple[int, int]]) -> NDArray[np.i
 
 
 def grid_places(rows: int, columns: int, frame: int, middle: tuple[int, int] = (0, 0)) -> NDArray[np.int64]:
-    """(frame, row, column) of a grid's tokens, row by row, counted from `middle`."""
+    """Return (frame, row, column) of a grid's tokens, row by row, counted from `middle`."""
     y, x = np.mgrid[:rows, :columns]
     return np.stack([np.full(rows * columns, frame), y.ravel() - middle[0], x.ravel() - middle[1]], axis=1)

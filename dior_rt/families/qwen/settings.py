@@ -1,4 +1,4 @@
-"""What a Qwen bundle says of its model beyond the manifest: the file qwen.json."""
+"""The settings of a Qwen bundle beyond the manifest: the file qwen.json."""
 
 from __future__ import annotations
 
@@ -15,13 +15,10 @@ MODULATION: Final = "modulation.npy"
 PROMPTS: Final = "prompts.npz"
 MOST_BYTES: Final = 1 << 20
 
-LUMI_SCALE: Final = 8.0  # light L is drawn as log(1 + 8 L) / log(1 + 8 peak)
-LUMI_PEAK: Final = 4.0  # the light that is drawn as white, unless a bundle says otherwise
-
 
 @dataclass(frozen=True)
 class VisionSettings:
-    """How a picture becomes patches for the vision tower, and where these sit."""
+    """How a picture becomes patches for the vision tower, and their positions."""
 
     area: int
     multiple: int
@@ -41,9 +38,9 @@ class VisionSettings:
 
 @dataclass(frozen=True)
 class TextSettings:
-    """The language model, and the prompts as its words: ids in the rows of `prompts.npz`.
+    """The language model, and the prompts as word ids: rows of `prompts.npz`.
 
-    picture_id: the word that stands for one feature of a picture; each prompt has it once a picture.
+    picture_id: the word that represents one feature of a picture; each prompt contains it once per picture.
     skip: words at the start of the template whose embeddings are dropped.
     """
 
@@ -61,11 +58,13 @@ class TextSettings:
 class QwenSettings:
     """The model's sizes.
 
-    area, multiple: the rule for the size of the pictures, in pixels. factor: pixels a latent; patch: latents
-    a token, each way. axes: how many of a head's numbers turn with frame, row and column. reference_at_zero:
-    the reference pictures are modulated as at sigma = 0. fixed_sigmas: the only schedule that the bundle has
-    modulation for; empty where it can compute any. lumi_peak: the light that is drawn as white. text: None
-    where the prompts' embeddings are in `prompts.npz` themselves.
+    area, multiple: the rule for the size of pictures, in pixels.
+    factor: pixels per latent; patch: latents per token, in each direction.
+    axes: how many of a head's numbers rotate with frame, row and column.
+    reference_at_zero: reference pictures are modulated as at sigma = 0.
+    fixed_sigmas: the only schedule for which the bundle has modulation; empty if it can compute any.
+    lumi_peak: the light that is shown as white.
+    text: None if `prompts.npz` holds the prompts' embeddings.
     """
 
     area: int
@@ -88,7 +87,7 @@ class QwenSettings:
 
 
 def read_settings(bundle: Bundle) -> QwenSettings:
-    """Read qwen.json; BundleError where it is missing or wrong."""
+    """Read qwen.json. Raises BundleError if it is missing or wrong."""
     path: Path = bundle.folder / FILE
     try:
         return parse(QwenSettings, read_json(path, MOST_BYTES))

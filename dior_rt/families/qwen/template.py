@@ -1,11 +1,11 @@
-"""What is said to Qwen-Image-Edit: the prompt of each mode, and the words around it."""
+"""The prompts of Qwen-Image-Edit: one per mode, and the template around them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Final
 
-# The words around every prompt that the model was trained with; the embeddings of the first 64 are dropped.
+# The template of every prompt in the model's training. The embeddings of its first 64 words are dropped.
 TEMPLATE: Final = (
     "<|im_start|>system\n"
     "Describe the key features of the input image (color, shape, size, texture, objects, background), then "
@@ -19,7 +19,7 @@ PICTURE: Final = "Picture {}: <|vision_start|><|image_pad|><|vision_end|>"
 
 @dataclass(frozen=True)
 class Prompts:
-    """What is said to the model in each mode; relight shows it two pictures, estimate one."""
+    """The prompt of each mode. relight shows the model two pictures, estimate one."""
 
     relight: str = (
         "Relight Picture 1 with the light that is drawn in Picture 2. Keep the viewpoint, the shapes, the "
@@ -29,7 +29,7 @@ class Prompts:
     negative: str = " "
 
     def each(self) -> dict[str, tuple[str, int]]:
-        """By the name that the runtime uses: the words, and how many pictures come with them."""
+        """Return, by the name in the runtime, the prompt and its number of pictures."""
         return {
             "relight": (self.relight, 2),
             "relight_negative": (self.negative, 2),

@@ -1,4 +1,4 @@
-"""The image autoencoder in tiles, so that its memory does not grow with the picture."""
+"""Run the image autoencoder in tiles, so that its memory does not grow with the picture."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
-TILE = 64  # latents a side: 512 pixels
+TILE = 64  # latents per side: 512 pixels
 OVERLAP = 16
 
 
 def encode_tiled(
     encode: Callable[[Array], Array], pixels: Array, factor: int, tile: int = TILE, overlap: int = OVERLAP
 ) -> Array:
-    """pixels (1, 3, h, w) -> latents (1, z, h / factor, w / factor); tile and overlap in latents."""
+    """Encode pixels (1, 3, h, w) to latents (1, z, h / factor, w / factor). tile and overlap are in
+    latents."""
     rows, columns = (side // factor for side in pixels.shape[2:])
 
     def part(y: slice, x: slice) -> Array:
@@ -29,7 +30,7 @@ def encode_tiled(
 def decode_tiled(
     decode: Callable[[Array], Array], latents: Array, factor: int, tile: int = TILE, overlap: int = OVERLAP
 ) -> Array:
-    """latents (1, z, h, w) -> pixels (1, 3, factor h, factor w)."""
+    """Decode latents (1, z, h, w) to pixels (1, 3, factor h, factor w)."""
     rows, columns = latents.shape[2:]
 
     def part(y: slice, x: slice) -> Array:
@@ -41,10 +42,10 @@ def decode_tiled(
 def _blend(
     part: Callable[[slice, slice], Array], rows: int, columns: int, tile: int, overlap: int, scale: int
 ) -> Array:
-    """Join overlapping parts, each weighted by a ramp that falls towards its edges; the weights sum to 1.
+    """Join overlapping tiles, weighted by ramps that fall towards their edges. The weights sum to 1.
 
-    part gives the result for a rectangle of latents; scale is the result's pixels a latent. One tile that
-    covers all is passed through as it is.
+    part: returns the result for a rectangle of latents. scale: pixels of the result per latent. A single
+    tile that covers everything is returned unchanged.
     """
     if rows <= tile and columns <= tile:
         return part(slice(0, rows), slice(0, columns))
@@ -64,7 +65,7 @@ def _blend(
 
 
 def _cuts(length: int, tile: int, overlap: int) -> list[slice]:
-    """Even, overlapping stretches of at most `tile` that cover the length."""
+    """Return even, overlapping intervals of at most `tile` that cover the length."""
     if length <= tile:
         return [slice(0, length)]
     count = -(-(length - overlap) // (tile - overlap))
@@ -73,7 +74,7 @@ def _cuts(length: int, tile: int, overlap: int) -> list[slice]:
 
 
 def _ramp(cut: slice, overlap: int, scale: int) -> Array:
-    """Rises from the stretch's first pixel over the overlap, and falls to its last."""
+    """Return weights that rise over the overlap at the start of an interval, and fall at its end."""
     length = (cut.stop - cut.start) * scale
     places = np.arange(length, dtype=np.float32) + 0.5
     return np.minimum(np.minimum(places, length - places) / overlap, 1)

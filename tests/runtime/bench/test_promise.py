@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dior_rt.bench.cases import from_renders, made_up
+from dior_rt.bench.cases import made_up
 from dior_rt.bench.promise import (
     IDENTICAL,
     MARGIN,
@@ -66,6 +66,7 @@ def test_candidates_come_cheapest_first_and_take_no_more_steps_than_the_model(sm
     assert {preset.steps for preset in tried} == {1, 2, 3, 4}
 
 
+@pytest.mark.slow
 def test_what_is_found_is_the_cheapest_that_keeps_its_promise(small: Relighter, monkeypatch) -> None:
     """Promises that this model can keep on a few steps, held to every cheaper candidate by brute force."""
     promises = {"near": 30.0, "far": 22.0}
@@ -117,6 +118,7 @@ def promises_broken(cases) -> dict[str, float]:
     return {name: one.worst for name, one in kept.items() if one.worst < PROMISES[name]}
 
 
+@pytest.mark.slow
 def test_the_model_that_ships_keeps_its_promises() -> None:
     assert promises_broken(made_up(FEW)) == {}
 
@@ -129,6 +131,7 @@ def test_it_keeps_them_in_the_worst_of_50_cases() -> None:
 @pytest.mark.slow
 def test_it_keeps_them_on_renders_that_training_has_not_seen(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
+    from dior_rt.training.data.bench_cases import from_renders
     from dior_rt.training.data.render import render_scenes
 
     render_scenes(tmp_path, 25, 900)  # a set of scenes of its own

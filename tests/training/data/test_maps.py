@@ -135,7 +135,7 @@ def test_maps_of_sources_add(kind) -> None:
     both = Stages(
         *(
             Stage(Shapes(stage.original.things | lamp), Shapes(stage.white.things | lamp))
-            for stage in (stages.own, stages.matte, stages.glossy)
+            for stage in (stages.original_stage, stages.matte, stages.glossy)
         )
     )
     one, other, together = (

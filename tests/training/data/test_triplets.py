@@ -30,7 +30,7 @@ from dior_rt.training.data.triplets import (
     tint,
     zoomed,
 )
-from dior_rt.training.network import decode_light, linear_to_srgb
+from dior_rt.training.light import decode_lumi, linear_to_srgb
 
 
 def pairs(views, kind: str, count: int = 12) -> list[tuple]:
@@ -172,7 +172,7 @@ def test_examples_speak_the_runtime_s_language(views) -> None:
     estimate = example(sample, shots, None, "estimate")
     assert not estimate["mask"].any() and not estimate["light"].any()
     assert int(estimate["mode"]) == mini.MODES["estimate"]
-    found = decode_light((estimate["x0"] + 1) / 2).permute(1, 2, 0)
+    found = decode_lumi((estimate["x0"] + 1) / 2).permute(1, 2, 0)
     np.testing.assert_allclose(found, sample.source, rtol=1e-3, atol=1e-5)
 
 

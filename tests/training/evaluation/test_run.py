@@ -125,12 +125,13 @@ def test_a_bundle_from_end_to_end(mini_bundle, renders, tmp_path) -> None:
     for table in evaluation.tables:
         assert table.pictures == 2 and table.estimate and np.isfinite(table.estimate.mean)
         controls = [row.control for row in table.rows]
-        assert controls[3:] == ["true maps", "estimated maps", "dense", "strokes"]
+        assert controls[3:] == ["true maps", "estimated maps", "dense", *["strokes"] * 3]
+        assert [row.method for row in table.rows[-3:]] == ["glow", "blur", "small"]
         assert table.rows[-1].seconds > 0
     assert evaluation.control.response.dabs == 1 and evaluation.borders.photos == 1
     text = markdown(evaluation)
     assert text.startswith("**small**: 1 steps, guidance 2, noise 1, reach 0.5\n")
-    assert text.count("| strokes |") == 2 and "cut from the true Lumi map" in text
+    assert text.count("| strokes |") == 6 and "cut from the true Lumi map" in text
     assert json.loads(as_json(evaluation))["control"]["response"]["dabs"] == 1
     write_report(tmp_path / "report", evaluation, examples)
     assert (tmp_path / "report" / "report.md").read_text() == text + "\n"
@@ -149,7 +150,7 @@ def test_real_pairs_are_driven_by_light_estimated_from_the_target(mini_bundle, t
     (found,) = open_benchmarks(tmp_path)
     table, examples = run(model, found.first(1))
     assert "estimated from the target by the same model" in table.control and table.estimate is None
-    assert [row.control for row in table.rows][3:] == ["estimated maps", "dense", "strokes"]
+    assert [row.control for row in table.rows][3:] == ["estimated maps", "dense", *["strokes"] * 3]
     task = next(iter(found))
     lumi, strokes = model.estimate(task.truth), examples[0].strokes
     drawn = strokes.mask > 0

@@ -150,10 +150,10 @@ def test_noise_that_does_not_go_is_told(monkeypatch) -> None:
 
 def test_another_recipe_or_no_recipe_in_the_folder(tmp_path) -> None:
     (tmp_path / "synthbench.json").write_text(json.dumps(asdict(Recipe(1))))
-    with pytest.raises(InputError, match="holds a SynthBench of another recipe"):
+    with pytest.raises(InputError, match="holds a SynthBench with other settings"):
         render_synthbench(tmp_path, Recipe(1, seed=5))
     (tmp_path / "synthbench.json").write_text("no")
-    with pytest.raises(InputError, match="describes no SynthBench"):
+    with pytest.raises(InputError, match="does not describe a SynthBench"):
         render_synthbench(tmp_path, Recipe(1))
     (tmp_path / "synthbench.json").write_text(json.dumps(asdict(Recipe(1))))
     with pytest.raises(InputError, match="has no pairs"):

@@ -9,20 +9,17 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from dior_rt.errors import InputError
-from dior_rt.families import mini
-from dior_rt.kernels import NumpyOps
-from dior_rt.training import network as module
+from dior_rt.training import light as physics
+from dior_rt.training.light import encode_lumi, srgb_to_linear
 from dior_rt.training.network import (
     Config,
     Mini,
-    decode_light,
-    encode_light,
-    linear_to_srgb,
+    features,
     load_network,
+    model,
     rotate,
     rotations,
     save_network,
-    srgb_to_linear,
 )
 
 SMALL = Config(width=32, depth=1, heads=2, patch=4, fine=4, half=8, quarter=16)
@@ -68,7 +65,7 @@ def test_untrained_it_returns_the_photo_if_nothing_is_drawn_and_takes_the_photo_
     network, given = Mini(SMALL), inputs(noise=True)
     np.testing.assert_allclose(found(network, {**given, "mask": 0 * given["mask"]}), 0, atol=1e-5)
     given["mode"] += 1
-    expected = 2 * encode_light(srgb_to_linear(given["photo"])) - 1
+    expected = 2 * encode_lumi(srgb_to_linear(given["photo"])) - 1
     torch.testing.assert_close(found(network, given), expected, atol=1e-5, rtol=1e-5)
 
 
@@ -79,8 +76,8 @@ def test_untrained_it_already_follows_the_drawn_light() -> None:
     given["light"] = 0.02 + 0.03 * given["light"]
     light = [given["light"], 2 * given["light"]]
     relit = [given["photo"] + found(network, {**given, "light": drawn}) / 4 for drawn in light]
-    lit = [torch.log(srgb_to_linear(one) + module.FLOOR) for one in relit]
-    ratio = torch.log((light[1] + module.BOUNCED) / (light[0] + module.BOUNCED))
+    lit = [torch.log(srgb_to_linear(one) + physics.FLOOR) for one in relit]
+    ratio = torch.log((light[1] + features.BOUNCED) / (light[0] + features.BOUNCED))
     torch.testing.assert_close(lit[1] - lit[0], ratio, atol=0.02, rtol=0.02)
 
 
@@ -89,9 +86,9 @@ def test_what_the_network_leaves_open_is_a_gaussian_about_what_it_expects() -> N
     sigmas = torch.linspace(1, 0, 4001, dtype=torch.float64)
     x = noise
     for sigma, then in pairwise(sigmas):
-        x = x + (then - sigma) * module.velocity(x, sigma, expected)
-    torch.testing.assert_close(x, expected + module.DEVIATION * noise, atol=2e-3, rtol=0)
-    assert module.velocity(noise, sigmas[-1], expected).isfinite().all(), "also where there is no noise left"
+        x = x + (then - sigma) * model.velocity(x, sigma, expected)
+    torch.testing.assert_close(x, expected + model.DEVIATION * noise, atol=2e-3, rtol=0)
+    assert model.velocity(noise, sigmas[-1], expected).isfinite().all(), "also where there is no noise left"
 
 
 @torch.no_grad()
@@ -127,10 +124,10 @@ def test_every_input_matters_but_light_that_is_not_specified(awake) -> None:
 @torch.no_grad()
 def test_the_photo_s_own_light_does_not_depend_on_strokes_state_or_time(awake) -> None:
     given, other = inputs(), inputs(seed=1)
-    own = awake(**given, with_own=True)[1]
+    own = awake(**given, with_source=True)[1]
     for changed in ({**other, "photo": given["photo"]}, {**given, "light": 16 * given["light"]}):
-        torch.testing.assert_close(awake(**changed, with_own=True)[1], own, atol=0, rtol=0)
-    assert not torch.equal(awake(**other, with_own=True)[1], own)
+        torch.testing.assert_close(awake(**changed, with_source=True)[1], own, atol=0, rtol=0)
+    assert not torch.equal(awake(**other, with_source=True)[1], own)
     torch.testing.assert_close(awake(**given, own=own), awake(**given), atol=0, rtol=0)
 
 
@@ -164,38 +161,38 @@ def test_relit_light_stays_physical(awake) -> None:
         dark = given["photo"] + found(awake, given) / 4
     assert bright.clamp(0, 1).min() > 0.99 and dark.clamp(0, 1).max() < 0.01
     black = torch.zeros(1, 3, 4, 4)
-    assert (module._relight(black, black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
+    assert (model.relit_answer(black, black, torch.ones(1, 3, 4, 4)) > 0.1).all(), "black can be lit"
 
 
 def test_no_weave_is_left_and_what_is_even_stays() -> None:
     rows, columns = torch.meshgrid(torch.arange(16.0), torch.arange(24.0), indexing="ij")
     slope = (0.3 * rows + 0.1 * columns)[None, None]
     for weave in ((-1) ** rows, (-1) ** columns, (-1) ** (rows + columns)):
-        mixed = module.even(slope + weave)
+        mixed = features.mix_neighbours(slope + weave)
         torch.testing.assert_close(mixed[..., 1:-1, 1:-1], slope[..., 1:-1, 1:-1], atol=1e-5, rtol=0)
     one = torch.full((2, 3, 8, 12), 0.7)
-    torch.testing.assert_close(module.even(one), one)
+    torch.testing.assert_close(features.mix_neighbours(one), one)
 
 
 def test_what_is_drawn_is_spread_as_it_is_and_no_farther_than_said() -> None:
     drawn = torch.zeros(1, 4, 64, 64)
     drawn[..., 20:24, 20:24] = torch.tensor([2.0, -1.0, 0.0, 1.0])[:, None, None]
-    near, everywhere = module.spread(drawn, 8), module.spread_everywhere(drawn)
+    near, everywhere = features.spread(drawn, 8), features.spread_everywhere(drawn)
     assert near[..., 52:].abs().max() < 0.02 and everywhere.std(dim=(2, 3)).max() == 0
     for *means, share in (near[0, :, 22, 22], everywhere[0, :, 0, 0]):
         assert 0.2 < share <= 1
         torch.testing.assert_close(torch.stack(means) / share, torch.tensor([2.0, -1.0, 0.0]))
-    assert module.spread(0 * drawn, 8).abs().max() == 0
+    assert features.spread(0 * drawn, 8).abs().max() == 0
 
 
 def test_what_is_drawn_is_spread_in_rounds_and_not_in_boxes() -> None:
     cells = torch.zeros(1, 1, 65, 65, dtype=torch.float64)
     cells[..., 32, 32] = 1
-    mean = module.around(cells, 6)[0, 0]
+    mean = features.around(cells, 6)[0, 0]
     rows, columns = torch.meshgrid(torch.arange(65) - 32.0, torch.arange(65) - 32.0, indexing="ij")
     expected = torch.exp(-(rows**2 + columns**2) / 72).double() / (72 * torch.pi)
     torch.testing.assert_close(mean, expected, atol=1e-6, rtol=0)
-    flat = module.around(torch.ones(1, 1, 5, 90), 6)
+    flat = features.around(torch.ones(1, 1, 5, 90), 6)
     torch.testing.assert_close(flat, torch.ones_like(flat))
 
 
@@ -206,26 +203,12 @@ def test_light_drawn_ends_softly_beside_a_stroke() -> None:
     given["mask"] = 0 * given["mask"]
     given["mask"][..., 20:44, 30:34] = 1
     relit = given["photo"] + found(Mini(SMALL), given) / 4
-    row = torch.log(srgb_to_linear(relit[0, 0, 32]) + module.FLOOR)
+    row = torch.log(srgb_to_linear(relit[0, 0, 32]) + physics.FLOOR)
     row = (row - row[0]) / (row[31] - row[0])
     assert (row[31:33] - 1).abs().max() < 1e-3, "under the stroke it is what was drawn"
     assert (row[[30, 33]] - 1).abs().max() < 0.15, "and next to its edge nearly"
     falls = -row[32:].diff()
     assert 0 < falls[0] < 0.2 and falls.max() < 0.2 and falls.min() > -1e-4
-
-
-def test_colour_is_the_kernels_colour() -> None:
-    values = torch.linspace(0, 1, 4097)
-    ops = NumpyOps()
-    np.testing.assert_allclose(linear_to_srgb(values), ops.encode_srgb(values.numpy(), np.float32), atol=2e-6)
-    np.testing.assert_allclose(srgb_to_linear(values), ops.decode_srgb(values.numpy()), atol=2e-6)
-
-
-def test_light_s_code_is_the_runtime_s() -> None:
-    light = torch.logspace(-4, 3, 200)
-    torch.testing.assert_close(decode_light(encode_light(light)), light, rtol=1e-4, atol=1e-6)
-    assert encode_light(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0, 1])
-    assert (module.RELIT_SCALE, module.LUMI_SCALE) == (mini.RELIT_SCALE, mini.LUMI_SCALE)
 
 
 def test_gradients_reach_every_weight_whatever_the_colour(awake) -> None:

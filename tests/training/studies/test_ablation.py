@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from dior_rt.errors import InputError
-from dior_rt.export.mini import Recipe, export_network
+from dior_rt.export.mini import MiniExportConfig, export_network
 from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.relight import Relighter
 from dior_rt.training.data.maps import KINDS, LUMI, render_maps
@@ -73,9 +73,10 @@ def noisy_mini() -> Mini:
     return network.eval()
 
 
+@pytest.mark.slow
 def test_a_network_relights_as_the_runtime_does_in_one_step_without_noise(tmp_path) -> None:
     network, random = noisy_mini(), np.random.default_rng(0)
-    recipe = Recipe(name="small", grid=GRID, steps=1, guidance=1.0, noise_scale=0.0)
+    recipe = MiniExportConfig(name="small", grid=GRID, steps=1, guidance=1.0, noise_scale=0.0)
     relighter = Relighter(
         export_network(network, recipe, tmp_path / "small", weights="fp32").folder, ops="numpy"
     )
@@ -137,12 +138,13 @@ def test_rows_are_judged_by_the_same_pictures(maps, tmp_path) -> None:
             view = View.load(path)
             images = view.images if kind == LUMI else view.images[..., ::-1]
             replace(view, images=images).save(tmp_path / kind / path.name)
-    with pytest.raises(InputError, match="not of the same pictures"):
+    with pytest.raises(InputError, match="show different pictures"):
         judge({Condition("other", "phong"): Unmoved()}, tmp_path)
     with pytest.raises(InputError, match="train maps"):
         judge({Condition("none", "shading"): Unmoved()}, tmp_path)
 
 
+@pytest.mark.slow
 def test_every_row_is_trained_once_and_differs_by_what_it_is_named_after(renders, maps, tmp_path) -> None:
     short = Plan(steps=2, batch=2, warmup=1, average=1, rate=4e-3, grids=((16, 16),))
     budget = Budget(TINY, short, replace(short, seed=1), rank=2, scenes=1)

@@ -9,12 +9,11 @@ import torch
 from safetensors.torch import load_file
 
 from dior_rt.cli import run
-from dior_rt.export.mini import Recipe as Exported
-from dior_rt.export.mini import export_network
+from dior_rt.export.mini import MiniExportConfig, export_network
 from dior_rt.kernels import Strokes
 from dior_rt.relight import Relighter
 from dior_rt.training.data.triplets import Batches
-from dior_rt.training.fit import STATE, Plan, draw_loud, flow_loss
+from dior_rt.training.fit import STATE, Plan, draw_noise_strength, flow_loss
 from dior_rt.training.network import WEIGHTS, Config, Mini, load_network
 from dior_rt.training.studies import recipes
 from dior_rt.training.studies.ablation import AHEAD, GRID, Network, Walk
@@ -61,13 +60,14 @@ def answer(network, batch, sigma: float, noise) -> torch.Tensor:
     return x - sigma * network(x=x, sigma=torch.full((len(x),), sigma), **seen(batch))
 
 
+@pytest.mark.slow
 def test_the_same_walk_as_the_runtimes(tmp_path) -> None:
     network, random = noisy_mini(0), np.random.default_rng(0)
     photo = random.integers(0, 256, (48, 64, 3), np.uint8)
     mask = np.zeros((48, 64), np.float32)
     mask[10:20, 30:50] = 1
     strokes = Strokes((random.uniform(0, 2, (48, 64, 3)) * mask[..., None]).astype(np.float32), mask)
-    exported = Exported(name="small", grid=GRID, steps=5, guidance=1.0, noise_scale=0.5)
+    exported = MiniExportConfig(name="small", grid=GRID, steps=5, guidance=1.0, noise_scale=0.5)
     bundle = export_network(network, exported, tmp_path / "small", weights="fp32")
     expected = np.asarray(Relighter(bundle.folder, ops="numpy").relight(photo, strokes, seed=3).picture)
     got = Network(network, Walk(5, 0.5, seed=3)).relight(photo, strokes)
@@ -106,7 +106,9 @@ def test_a_flow_about_an_estimate_is_the_flow_of_what_that_leaves_open(batch) ->
 
 def test_the_estimate_stays_and_the_flow_learns(batch) -> None:
     about = AboutEstimate(noisy_mini(1), noisy_mini(1))
-    flow_loss(about, batch, torch.full((4,), 0.5), torch.zeros_like(batch["x0"]), own=0.25).backward()
+    flow_loss(
+        about, batch, torch.full((4,), 0.5), torch.zeros_like(batch["x0"]), source_weight=0.25
+    ).backward()
     assert all(weight.grad is None for weight in about.estimate.parameters())
     assert all(weight.grad is not None for weight in about.flow.parameters())
 
@@ -153,7 +155,7 @@ def test_a_steps_cost_is_that_of_its_products() -> None:
             super().__init__()
             self.mix = torch.nn.Conv2d(3, 3, 1, bias=False)
 
-        def forward(self, x, with_own=False, **given):
+        def forward(self, x, with_source=False, **given):
             return self.mix(x), x
 
     # The state needs no gradient, so the way back is as dear as the way there.
@@ -161,20 +163,23 @@ def test_a_steps_cost_is_that_of_its_products() -> None:
 
 
 def test_noise_of_a_strength() -> None:
-    drawn = draw_loud(1000, Plan(steps=1, silent=0.3, noise=0.25), torch.Generator().manual_seed(0))
+    drawn = draw_noise_strength(
+        1000, Plan(steps=1, noiseless=0.3, noise=0.25), torch.Generator().manual_seed(0)
+    )
     assert set(drawn.flatten().tolist()) == {0.0, 0.25}
     assert float((drawn == 0).float().mean()) == pytest.approx(0.3, abs=0.05)
 
 
 FEW = (
     RECIPES[0],
-    Recipe("noise", silent=0, always_noise=0, walks=(ONCE, Walk(2, 1.0))),
-    Recipe("warm", silent=0, always_noise=0, share=0.5, after=HALF),
-    Recipe("about", silent=0, always_noise=0, share=0.5, after=HALF, about=True),
+    Recipe("noise", noiseless=0, always_noise=0, walks=(ONCE, Walk(2, 1.0))),
+    Recipe("warm", noiseless=0, always_noise=0, share=0.5, after=HALF),
+    Recipe("about", noiseless=0, always_noise=0, share=0.5, after=HALF, about=True),
     Recipe("severed", blended=False),
 )
 
 
+@pytest.mark.slow
 def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_path) -> None:
     seen = []
     first = replace(FEW[0], walks=(ONCE,))
@@ -206,6 +211,7 @@ def test_every_row_is_trained_once_and_judged_by_the_same_pictures(renders, tmp_
     assert again == evaluation and len(seen) == seen[-1]
 
 
+@pytest.mark.slow
 def test_a_stopped_study_goes_on_with_the_batches_it_had_not_seen(renders, tmp_path) -> None:
 
     def stop(step: int, loss: float) -> None:

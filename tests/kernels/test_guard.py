@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dior_rt.kernels import KernelError, NumpyOps, Stroke, open_ops
-from dior_rt.kernels.tested import TestedOps
+from dior_rt.kernels.guard import GuardedOps
 
 RNG = np.random.default_rng(0)
 PHOTO = RNG.integers(0, 256, (20, 30, 3), dtype=np.uint8)
@@ -36,7 +36,7 @@ class WrongAt16(NumpyOps):
 
 def test_an_operation_is_tried_once_for_each_dtype():
     inner = Counting()
-    ops = TestedOps(inner)
+    ops = GuardedOps(inner)
     assert inner.relit == 0
     ops.transfer(PHOTO, *LIGHT)
     tried = inner.relit - 1
@@ -48,7 +48,7 @@ def test_an_operation_is_tried_once_for_each_dtype():
 
 
 def test_what_fails_for_one_dtype_is_refused_for_that_alone():
-    ops, deep = TestedOps(WrongAt16()), PHOTO.astype(np.uint16) * 257
+    ops, deep = GuardedOps(WrongAt16()), PHOTO.astype(np.uint16) * 257
     np.testing.assert_array_equal(ops.transfer(PHOTO, *LIGHT), NumpyOps().transfer(PHOTO, *LIGHT))
     for _ in range(2):
         with pytest.raises(KernelError, match="transfer of uint16 from"):
@@ -56,7 +56,7 @@ def test_what_fails_for_one_dtype_is_refused_for_that_alone():
 
 
 def test_a_spare_takes_over_and_it_is_said():
-    ops, deep = TestedOps(WrongAt16(), spare=NumpyOps()), PHOTO.astype(np.uint16) * 257
+    ops, deep = GuardedOps(WrongAt16(), spare=NumpyOps()), PHOTO.astype(np.uint16) * 257
     ops.transfer(PHOTO, *LIGHT)
     assert ops.name == "wrong"
     np.testing.assert_array_equal(ops.transfer(deep, *LIGHT), NumpyOps().transfer(deep, *LIGHT))
@@ -71,7 +71,7 @@ def test_what_cannot_even_read_a_photo_is_refused_at_once():
             return super()._reduce_photo(picture, grid) * np.float32(0.99)
 
     with pytest.raises(KernelError, match="reduce_photo of uint8"):
-        TestedOps(Blind(), spare=NumpyOps())
+        GuardedOps(Blind(), spare=NumpyOps())
 
 
 def test_what_is_opened_agrees_with_numpy_in_every_operation():

@@ -1,0 +1,80 @@
+"""Colour and light encodings as batched torch operations. All pictures are (B, C, H, W)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+LUMI_SCALE = 8.0  # encode(L) = log(1 + 8 L) / log 9: 0 to 0, 1 to 1
+FLOOR = 0.02  # added to a photo's linear values before a ratio is taken, so that black can be lit
+BOUNCED = 0.02  # light that reaches a surface where no source shines
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
+
+
+def srgb_to_linear(encoded: Tensor) -> Tensor:
+    """IEC 61966-2-1, for values in 0..1."""
+    curve = ((encoded.clamp_min(0.04) + 0.055) / 1.055) ** 2.4
+    return torch.where(encoded <= 0.04045, encoded / 12.92, curve)
+
+
+def linear_to_srgb(linear: Tensor) -> Tensor:
+    """IEC 61966-2-1, for values in 0..1; the straight part near black goes on below 0."""
+    curve = 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
+
+
+def encode_light(light: Tensor) -> Tensor:
+    """Map light 0..inf to log(1 + 8 L) / log 9."""
+    return torch.log1p(LUMI_SCALE * light) / math.log1p(LUMI_SCALE)
+
+
+def decode_light(encoded: Tensor) -> Tensor:
+    """Invert `encode_light`; negative codes become 0."""
+    return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
+
+
+def luminance(colour: Tensor) -> Tensor:
+    """(B, 3, ...) to (B, 1, ...)."""
+    red, green, blue = LUMINANCE
+    return red * colour[:, 0:1] + green * colour[:, 1:2] + blue * colour[:, 2:3]
+
+
+def log_light(light: Tensor) -> Tensor:
+    """The logarithm in which errors of light are measured; finite in the dark."""
+    return torch.log(light + BOUNCED)
+
+
+def gaussian_matrix(size: int, deviation: Tensor | float, like: Tensor) -> Tensor:
+    """(size, size): row i holds the weights of all cells for cell i, which sum to 1."""
+    place = torch.arange(size, dtype=torch.float32, device=like.device)
+    weights = torch.exp(-0.5 * ((place[:, None] - place) / deviation) ** 2)
+    return (weights / weights.sum(dim=1, keepdim=True)).to(like.dtype)
+
+
+def blur(cells: Tensor, deviation: float) -> Tensor:
+    """Blur (B, C, H, W) by a Gaussian of `deviation` cells; the border's weights are normalised."""
+    down = gaussian_matrix(cells.shape[2], deviation, cells)
+    across = gaussian_matrix(cells.shape[3], deviation, cells)
+    return down @ cells @ across.T
+
+
+def spread(values: Tensor, mask: Tensor, deviation: float, least: float = 1e-3) -> Tensor:
+    """The mean of masked values around every cell (normalised convolution), fading to 0 far from the mask.
+
+    values: (B, C, H, W). mask: (B, 1, H, W) in 0..1. least: the share of drawn cells at which half remains.
+    """
+    both = blur(torch.cat([values * mask, mask], dim=1).float(), deviation)
+    return both[:, :-1] / (both[:, -1:] + least)
+
+
+def double(cells: Tensor) -> Tensor:
+    """Bilinear resampling to twice the sides, as slices: its gradient needs no scattered additions."""
+    for dim in (2, 3):
+        first, last = cells.narrow(dim, 0, 1), cells.narrow(dim, cells.shape[dim] - 1, 1)
+        before = torch.cat([first, cells.narrow(dim, 0, cells.shape[dim] - 1)], dim=dim)
+        after = torch.cat([cells.narrow(dim, 1, cells.shape[dim] - 1), last], dim=dim)
+        pair = torch.stack([0.25 * before + 0.75 * cells, 0.75 * cells + 0.25 * after], dim=dim + 1)
+        cells = pair.flatten(dim, dim + 1)
+    return cells
