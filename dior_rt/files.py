@@ -81,7 +81,7 @@ def check_writable(path: Path) -> None:
 
 def check_free(path: Path, overwrite: bool) -> None:
     """Raise InputError where a file is there already, unless it may be replaced."""
-    if path.exists() and not overwrite:
+    if not overwrite and is_there(path):
         raise InputError(f"{path} is there already. Give --overwrite to replace it, or name another file.")
 
 
@@ -102,6 +102,14 @@ def check_readable(path: Path, what: str) -> None:
         raise InputError(f"Cannot read the {what} {path}: there is no such file.") from error
     except (OSError, ValueError) as error:
         raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
+
+
+def is_there(path: Path) -> bool:
+    """Whether a path leads to something; False for one that cannot be followed, whose use says why."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def is_same_file(one: Path, other: Path) -> bool:

@@ -397,7 +397,9 @@ class OpenPhoto:
     @cached_property
     def _reduced(self) -> tuple[Array, Array]:
         relighter = self._relighter
-        return relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
+        source, encoded = relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
+        # The network sees nothing brighter than white; its ratio at white is applied to brighter light as well.
+        return np.minimum(source, np.float32(1)), encoded
 
     @cached_property
     def _source_map(self) -> Array:

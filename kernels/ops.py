@@ -26,7 +26,7 @@ class Ops(ABC):
     always new.
 
     name: the device that computes. reason: why it was chosen, in one sentence. notice: what the user should
-    know of the choice, one sentence or "".
+    know of the choice, in one sentence, or "".
     """
 
     name: str

@@ -2,9 +2,9 @@
 
     python -m tools.fuzz --count 100000 --seed 1
 
-An input is a sound file with some bytes changed, cut, doubled or removed. It must be read, or refused with a
-DiorError of one line, within ten seconds of the processor, and leave no file behind. Input number N of a kind
-is the same in every run with the same seed, so `--kinds photos --only N` repeats one. Work is done in
+An input is a sound file with some bytes changed, cut, doubled or removed. It must be read, or refused with
+a DiorError of one line, within ten seconds of the processor, and leave no file behind. Input number N of a
+kind is the same in every run with the same seed, so `--kinds photos --only N` repeats one. Work is done in
 processes of their own, since a library that crashes takes its process along.
 """
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from threading import BoundedSemaphore, Event
 from typing import Final
@@ -28,7 +28,9 @@ class LocalEngine:
     at_once: int | None
     most_pixels: int
 
-    def run(self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]) -> Iterator[Outcome]:
+    def run(
+        self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]
+    ) -> Generator[Outcome, None, None]:
         """Yield the outcomes as they come; `begin` is told each result's name before it may be written."""
         weights = sum((self.bundle.folder / file).stat().st_size for file in self.bundle.manifest.files)
         at_once = self.at_once or (usable_cores() if weights < SMALL_MODEL else 1)

@@ -7,7 +7,7 @@ workers and the pixels in flight bound the memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from threading import Event
@@ -29,7 +29,7 @@ def run_jobs(
     most_pixels: int,
     stop: Event,
     weigh: Callable[[Path], int] | None = None,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome, None, None]:
     """Yield the outcomes as they come. At most `workers` photos, of `most_pixels` together, are in flight.
 
     A photo larger than that goes alone. When the caller stops early, or presses Ctrl-C, no further job

@@ -91,13 +91,13 @@ def _needs_work(job: Job, record: Record | None, settings: str, overwrite: bool)
     """Whether the result is to be made. Raises InputError where that would replace somebody's file."""
     there = job.result.exists()
     if record and record.output and record.photo and record.strokes:
-        ours = record.output.fits(job.result)
+        unaltered = record.output.fits(job.result)
         same = (
             record.settings == settings and record.photo.fits(job.photo) and record.strokes.fits(job.strokes)
         )
-        if ours and same:
+        if unaltered and same:
             return False
-        if there and not ours and not overwrite:
+        if there and not unaltered and not overwrite:
             raise InputError(f"{job.result} was changed after it was made. Give --overwrite to replace it.")
         return True
     if record:  # begun and not done: what is there is what a killed process left

@@ -11,7 +11,7 @@ import logging
 import os
 import pickle
 import socket
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -57,7 +57,9 @@ class RayEngine:
     address: str | None = None
     workers: int | None = None
 
-    def run(self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]) -> Iterator[Outcome]:
+    def run(
+        self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]
+    ) -> Generator[Outcome, None, None]:
         """Yield the outcomes as they come; `begin` is told the results' names before any is written.
 
         Raises DeviceError where the cluster cannot be reached, or gives up.
@@ -76,7 +78,11 @@ class RayEngine:
             threads = os.environ.get("OMP_NUM_THREADS") or str(usable_cores())
             environment = {"env_vars": {"OMP_NUM_THREADS": threads}}
             ray.init(
-                self.address, log_to_driver=False, logging_level="ERROR", runtime_env=environment, **alone
+                self.address,
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                runtime_env=environment,
+                **alone,
             )
         except Exception as error:  # Ray raises a bare Exception where its own processes do not start
             raise DeviceError(f"Cannot use Ray's cluster {self.address or ''}: {reason(error)}.") from error
@@ -94,7 +100,7 @@ class RayEngine:
         rows = [{"job": pickle.dumps(job)} for job in jobs]
         most = self.workers or max(1, int(ray.cluster_resources().get("CPU", 1)))
         done = ray.data.from_items(rows, override_num_blocks=min(len(rows), MOST_TASKS)).map(
-            Worker,
+            Worker,  # type: ignore[arg-type]
             fn_constructor_args=(self.bundle.resolve(), self.device, self.ops, recipe),
             compute=ray.data.ActorPoolStrategy(min_size=1, max_size=min(most, len(rows))),
             num_cpus=1,

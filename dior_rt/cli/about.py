@@ -68,8 +68,8 @@ def info(
     manifest = found.manifest
     config, defaults = config_path(), read_defaults()
     if as_json:
-        own = {"config": str(config), "defaults": [unparse(default) for default in defaults]}
-        say(json.dumps({"folder": str(found.folder), **unparse(manifest), **own}, indent=2))
+        personal = {"config": str(config), "defaults": [unparse(default) for default in defaults]}
+        say(json.dumps({"folder": str(found.folder), **unparse(manifest), **personal}, indent=2))
         return
     megabytes = sum((found.folder / file).stat().st_size for file in manifest.files) / 1e6
     rows = {
@@ -85,7 +85,7 @@ def info(
     }
     table(list(rows.items()))
     say("")
-    here = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
+    here: list[tuple[str, object]] = [("config", f"{config}{'' if config.exists() else ' (not there)'}")]
     for default in defaults:
         name = f"{default.command} {default.setting}" if default.command else default.setting
         value = default.value if isinstance(default.value, str) else " ".join(default.value)

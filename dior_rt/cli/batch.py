@@ -112,7 +112,7 @@ def batch(
     from dior_rt.batch.progress import Progress
     from dior_rt.batch.work import Recipe
     from dior_rt.bundle import default_bundle, read_bundle
-    from dior_rt.cli.extras import needs_extra
+    from dior_rt.extras import needs_extra
     from dior_rt.files import check_readable, make_folder, remove_drafts
     from dior_rt.images.encoding import Encoding
 

@@ -79,8 +79,8 @@ def defaults_of(command: str, defaults: list[Default]) -> dict[str, str | list[s
 
 def unknown_variables(environment: Mapping[str, str] = os.environ) -> list[str]:
     """Variables that look like defaults and are none."""
-    known = {CONFIG, *map(variable, SETTINGS)}
-    return sorted(name for name in environment if name.startswith(PREFIX) and name not in known)
+    choices = {CONFIG, *map(variable, SETTINGS)}
+    return sorted(name for name in environment if name.startswith(PREFIX) and name not in choices)
 
 
 def variable(setting: str) -> str:
@@ -105,8 +105,8 @@ def _read_file(path: Path, must: bool) -> list[Default]:
     for key, value in document.items():
         if isinstance(value, dict):
             if key not in COMMANDS:
-                known = ", ".join(COMMANDS)
-                raise InputError(f"{path}: there is no command [{key}] to configure. There are {known}.")
+                choices = ", ".join(COMMANDS)
+                raise InputError(f"{path}: there is no command [{key}] to configure. There are {choices}.")
             found += [_default(name, inner, path, key) for name, inner in value.items()]
         else:
             found.append(_default(key, value, path, None))

@@ -109,14 +109,14 @@ def relight(
     check_readable(photo, "photo")
     encoding = Encoding(quality, int(bits) if bits else None)
     out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or default_form(photo)}"), format)
-    _refuse_same(out, photo, strokes)
-    check_free(out, overwrite)
-    if sidecar:
-        check_free(sidecar_path(out), overwrite)
     project = read_project(strokes) if strokes.suffix.lower() == SUFFIX else None
     if project:  # its settings hold unless the command line says otherwise
         preset, steps = preset or project.settings.preset, steps or project.settings.steps
         seed, intensity = seed or project.settings.seed, intensity * project.settings.intensity
+    _refuse_same(out, photo, strokes)
+    check_free(out, overwrite)
+    if sidecar:
+        check_free(sidecar_path(out), overwrite)
     with _loading(bundle, device, ops) as load:
         picture = read_photo(photo).with_bits(encoding.bits)
         check_output(out, picture, encoding)

@@ -33,7 +33,7 @@ def read(path: Path) -> Photo:
     alpha = None
     if picture.pixels.shape[2] == 4:
         alpha = np.clip(np.nan_to_num(picture.pixels[..., 3]), 0, 1).astype(np.float32)
-        light = np.divide(light, alpha[..., None], out=np.zeros_like(light), where=alpha[..., None] > 0)
+        light = np.divide(light, alpha[..., None], out=np.zeros_like(light), where=(alpha > 0)[..., None])
     if (matrix := conversion(picture.primaries, srgb())) is not None:
         light = convert(light, matrix).astype(np.float32)
         notices.append("Its colours are converted to sRGB's primaries.")

@@ -80,8 +80,8 @@ def read_drawing(
     photo_size: (height, width) of the photo. key: "black" reads pixels that are exactly black as unspecified.
     page: which one is read of a file with several. primaries: the photo's own, None for sRGB's; light in
     others is converted. A raster comes as (H, W, 4): uint8 or uint16, sRGB-encoded, or float32, linear;
-    the last channel is the mask. JSON comes as strokes in the photo's pixels, or as lights where any of them
-    blends; a project comes as its lights. Raises InputError for what cannot be read or makes no sense.
+    the last channel is the mask. JSON comes as strokes in the photo's pixels, or as lights where any of
+    them blends; a project as its lights. Raises InputError for what cannot be read or makes no sense.
     """
     target = srgb() if primaries is None else primaries
     if path.suffix.lower() == project.SUFFIX:

@@ -173,6 +173,7 @@ def test_auto_passes_over_an_accelerator_that_cannot_start(mini_bundle, monkeypa
     built = onnxruntime.get_available_providers()
     missing = next(name for name, provider in PROVIDERS.items() if provider.ort_name not in built)
     monkeypatch.setattr(providers, "available", lambda: [missing, "cpu"])
+    monkeypatch.setattr(providers, "is_built_in", lambda name: True)
     engine = open_engine(read_bundle(mini_bundle), "velocity")
     assert engine.device == "cpu"
     assert missing in engine.reason

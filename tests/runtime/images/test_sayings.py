@@ -367,7 +367,9 @@ def raw_file(path: Path, order: str = "<") -> None:
     assert small
 
 
-def test_camera_raw_is_refused_and_not_relit_as_its_thumbnail(tmp_path: Path) -> None:
+def test_camera_raw_is_refused_and_not_relit_as_its_thumbnail(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "rawpy", None)  # with it, they are developed
+    monkeypatch.delitem(sys.modules, "dior_rt.images.raw", raising=False)
     for order in "<>":
         raw_file(tmp_path / "a.dng", order)
         assert "camera raw" in refused(tmp_path / "a.dng")
