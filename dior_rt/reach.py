@@ -22,12 +22,16 @@ def check_reach(reach: float | None) -> None:
 
 
 def within_reach(source: Array, relit: Array, mask: Array, reach: float) -> Array:
-    """Return the relit light with its log-ratio to the source scaled by `closeness`.
+    """Return `relit` where the mask (h, w) is above 0, fading to `source` beyond the reach."""
+    return fade(source, relit, closeness(mask > 0, reach))
 
-    source, relit: (h, w, 3) linear light; mask: (h, w), above 0 where anything is drawn.
+
+def fade(source: Array, relit: Array, nearness: Array) -> Array:
+    """Return the relit light with its log-ratio to the source scaled by `nearness`.
+
+    source, relit: (h, w, 3) linear light; nearness: (h, w), 1 is all of `relit` and 0 all of `source`.
     """
-    ratio = log_ratio(relit, source) * closeness(mask > 0, reach)[..., None]
-    return apply_log_ratio(source, ratio)
+    return apply_log_ratio(source, log_ratio(relit, source) * nearness[..., None])
 
 
 def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:

@@ -23,6 +23,11 @@ def read_json(path: Path, most_bytes: int) -> Any:
         data = file.read(most_bytes + 1)
     if len(data) > most_bytes:
         raise ValueError(f"it is longer than {most_bytes} bytes")
+    return loads(data)
+
+
+def loads(data: bytes) -> Any:
+    """The JSON document in `data`, as strictly as `read_json`. Raises ValueError."""
     try:
         # Windows' shells write UTF-16, or UTF-8 with a mark; the standard lets a reader take both.
         text = data.decode(json.detect_encoding(data))

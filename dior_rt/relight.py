@@ -7,10 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Unpack
+from threading import Lock
+from typing import Any, TypeGuard, Unpack, cast
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from dior_rt import __version__
 from dior_rt.bundle import Bundle, default_bundle, read_bundle
@@ -30,12 +34,19 @@ from dior_rt.images.arrays import (
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.types import STRONGEST
 from dior_rt.light import decode_small
+from dior_rt.lights import Composed, Cover, Light, compose, cover
 from dior_rt.presets import ALWAYS, REFERENCE, read_presets
-from dior_rt.reach import check_reach, within_reach
+from dior_rt.reach import check_reach, closeness, fade
 from dior_rt.sampling import DEFAULTS, Sampling, SamplingFields, SamplingOptions, resolve_sampling
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
+#: What a person can draw: light and mask, strokes as lines, an RGBA picture, or layers.
+Drawing = Strokes | Sequence[Stroke] | Picture | Sequence[Light]
+
+MOST_COVERS = 64  # layers whose light grids an open photo keeps
+
+MOST_SIZES = 4  # sizes of its previews at which an open photo is kept
 
 CANVAS = 2048  # pixels of the longest side on which strokes given as lines are drawn
 
@@ -145,11 +156,17 @@ class Relighter:
             "ops": self.ops,
         }
 
-    @_device_errors()
+    def open(self, photo: Picture) -> OpenPhoto:
+        """Prepare a photo to be relit many times: what depends on the photo alone is computed once.
+
+        photo: as `relight` takes it. Raises InputError.
+        """
+        return OpenPhoto(self, photo)
+
     def relight(
         self,
         photo: Picture,
-        strokes: Strokes | Sequence[Stroke] | Picture,
+        strokes: Drawing,
         options: SamplingOptions = DEFAULTS,
         *,
         seed: int = 0,
@@ -165,43 +182,23 @@ class Relighter:
         strokes: one of
           - Strokes, or RGBA as a Pillow image or an array (H, W, 4), shaped like the photo or like its light
             grid, of any size; alpha 0 = unspecified, integers are sRGB-encoded and floats linear;
-          - a list of Stroke, in pixels of the photo.
+          - a list of Stroke, in pixels of the photo;
+          - a list of Light, which `dior_rt.lights` composes with the light on the photo.
         options: how the flow is sampled. The fields of SamplingOptions may also be given as keywords, such
           as preset="fast" or steps=4; a keyword takes precedence.
         seed: of the starting noise.
         intensity: multiplies the light of the strokes, >= 0.
         reach: how far from the strokes light changes, in longer sides of the photo, see `within_reach`;
-          None leaves it to the model.
+          None leaves it to the model, or to each Light.
         progress: called after each step with (step, steps); it may skip steps where the solver chooses its
           own. Returning False stops with Cancelled.
 
         Raises InputError for what cannot be used, and DeviceError where a device fails.
         """
-        how = resolve_sampling(self.bundle, options.override(**fields))
-        _check_seed(seed)
-        _check_intensity(intensity)
-        check_reach(reach)
-        watch = Stopwatch()
-        pixels = read_pixels(photo)
-        raster = self._family.raster(*pixels.shape[:2])
-        drawn = self._reduce_strokes(in_primaries_of(photo, strokes), pixels.shape[:2], raster, intensity)
-        if not drawn.mask.any():
-            return Relit(
-                like_photo(pixels.copy(), photo), NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach
-            )
-        source, encoded = self._family.reduce_photo(pixels, raster, self._ops)
-        # The network knows nothing brighter than white; its ratio there goes for brighter light as well.
-        source = np.minimum(source, np.float32(1))
-        watch.lap("kernels")
-        condition = self._family.encode(encoded, drawn, "relight")
-        x0, taken = self._sample(condition, how, seed, progress)
-        watch.lap("steps")
-        relit = decode_small(self._family.decode_relit(x0, condition))
-        if reach is not None:
-            relit = within_reach(source, relit, drawn.mask, reach)
-        picture = like_photo(self._ops.transfer(pixels, source, relit), photo)
-        watch.lap("transfer")
-        return Relit(picture, None, watch.seconds, taken, how, seed, intensity, reach)
+        opened = self.open(photo)
+        return opened.relight(
+            strokes, options, seed=seed, intensity=intensity, reach=reach, progress=progress, **fields
+        )
 
     @_device_errors()
     def estimate(
@@ -222,6 +219,14 @@ class Relighter:
         pixels = read_pixels(photo)
         raster = self._family.raster(*pixels.shape[:2])
         _, encoded = self._family.reduce_photo(pixels, raster, self._ops)
+        return self._estimate(encoded, how, seed, progress)
+
+    def _fast(self, **asked: Any) -> Sampling:
+        """Return the sampling of the fast preset, or of the reference where the model has none."""
+        preset = "fast" if "fast" in self.presets else None
+        return resolve_sampling(self.bundle, SamplingOptions(preset=preset, **asked))
+
+    def _estimate(self, encoded: Array, how: Sampling, seed: int, progress: Progress | None) -> Array:
         condition = self._family.encode(encoded, None, "estimate")
         x0, _ = self._sample(condition, how, seed, progress)
         return self._family.decode_lumi(x0, condition)
@@ -297,6 +302,186 @@ class Relighter:
         if how.interval == ALWAYS or how.guidance == 1:
             return guided
         return between(*how.interval, guided, self._family.velocity(condition, sigmas, 1.0))
+
+
+class OpenPhoto:
+    """One photo on a `Relighter`, to be relit many times. Safe to use from several threads.
+
+        photo = relighter.open(Image.open("photo.jpg"))
+        lamp = Light(drawn, blend="add", reach=0.2)
+        photo.preview([lamp]).picture      # small and fast
+        photo.relight([lamp]).picture      # the photo's size, every step
+
+    photo: as it was given. size: (rows, columns).
+    """
+
+    def __init__(self, relighter: Relighter, photo: Picture) -> None:
+        self.photo = photo
+        self._relighter = relighter
+        self._pixels = read_pixels(photo)
+        self.size: tuple[int, int] = self._pixels.shape[:2]
+        self._raster = relighter._family.raster(*self.size)
+        self._small: dict[int, NDArray] = {}
+        self._covers: list[tuple[Strokes | tuple[Stroke, ...], Cover]] = []
+        self._lock = Lock()
+
+    @_device_errors()
+    def relight(
+        self,
+        lights: Drawing,
+        options: SamplingOptions = DEFAULTS,
+        *,
+        seed: int = 0,
+        intensity: float = 1.0,
+        reach: float | None = None,
+        progress: Progress | None = None,
+        **fields: Unpack[SamplingFields],
+    ) -> Relit:
+        """Return the photo under the lights, at full size: `Relighter.relight` explains each argument."""
+        how = resolve_sampling(self._relighter.bundle, options.override(**fields))
+        return self._relight(self._pixels, self.photo, lights, how, seed, intensity, reach, progress)
+
+    @_device_errors()
+    def preview(
+        self,
+        lights: Drawing,
+        *,
+        longest: int = 1024,
+        steps: int | None = None,
+        seed: int = 0,
+        intensity: float = 1.0,
+        reach: float | None = None,
+        progress: Progress | None = None,
+    ) -> Relit:
+        """The photo under the lights, fast: at most `longest` pixels a side, by the model's fast preset.
+
+        The light is that of `relight` with as many steps: the light grid is the full photo's. The picture is
+        uint8, (rows, columns, 3).
+        """
+        if longest < 1:
+            raise InputError(f"A preview must have at least 1 pixel a side, not {longest}.")
+        how = self._relighter._fast(steps=steps)
+        small = self.small(longest)
+        return self._relight(small, small, lights, how, seed, intensity, reach, progress)
+
+    def small(self, longest: int) -> NDArray[np.uint8]:
+        """The photo itself at the size of a preview: uint8, (rows, columns, 3)."""
+        scale = min(1.0, longest / max(self.size))
+        height, width = (max(1, round(side * scale)) for side in self.size)
+        with self._lock:
+            if longest not in self._small:
+                if len(self._small) >= MOST_SIZES:
+                    self._small.clear()
+                # For the eye alone, so Pillow's fast mean of the encoded values will do.
+                image = Image.fromarray(_to_8_bits(self._pixels))
+                reduced = image.resize((width, height), Image.Resampling.BOX, reducing_gap=2.0)
+                self._small[longest] = np.asarray(reduced)
+            return self._small[longest]
+
+    @_device_errors()
+    def source_map(self) -> Array:
+        """The light on the photo, by the model: a Lumi map (h, w, 3), linear >= 0, of the light grid."""
+        return self._source_map.copy()
+
+    @_device_errors()
+    def target_map(self, lights: Sequence[Light], *, intensity: float = 1.0) -> Strokes:
+        """What the lights ask for, composed with the source map, on the light grid."""
+        return self._compose(lights, intensity).target
+
+    @cached_property
+    def _reduced(self) -> tuple[Array, Array]:
+        relighter = self._relighter
+        source, encoded = relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
+        # The network knows nothing brighter than white; its ratio there goes for brighter light as well.
+        return np.minimum(source, np.float32(1)), encoded
+
+    @cached_property
+    def _source_map(self) -> Array:
+        how = self._relighter._fast(guidance=1.0)
+        return self._relighter._estimate(self._reduced[1], how, seed=0, progress=None)
+
+    def _relight(
+        self,
+        pixels: NDArray,
+        like: Picture,
+        lights: Drawing,
+        how: Sampling,
+        seed: int,
+        intensity: float,
+        reach: float | None,
+        progress: Progress | None,
+    ) -> Relit:
+        relighter = self._relighter
+        _check_seed(seed)
+        _check_intensity(intensity)
+        check_reach(reach)
+        watch = Stopwatch()
+        composed = self._target(lights, intensity, reach)
+        if not composed.target.mask.any():
+            unchanged = like_photo(pixels.copy(), like)
+            return Relit(unchanged, NOTHING_DRAWN, watch.seconds, 0, how, seed, intensity, reach)
+        source, encoded = self._reduced
+        watch.lap("kernels")
+        condition = relighter._family.encode(encoded, composed.target, "relight")
+        x0, taken = relighter._sample(condition, how, seed, progress)
+        watch.lap("steps")
+        relit = decode_small(relighter._family.decode_relit(x0, condition))
+        if composed.nearness is not None:
+            relit = fade(source, relit, composed.nearness)
+        picture = like_photo(relighter._ops.transfer(pixels, source, relit), like)
+        watch.lap("transfer")
+        return Relit(picture, None, watch.seconds, taken, how, seed, intensity, reach)
+
+    def _target(self, lights: Drawing, intensity: float, reach: float | None) -> Composed:
+        if _are_layers(lights):
+            if reach is not None:
+                lights = [replace(light, reach=light.reach or reach) for light in lights]
+            return self._compose(lights, intensity)
+        strokes = in_primaries_of(self.photo, cast("Strokes | Sequence[Stroke] | Picture", lights))
+        drawn = self._relighter._reduce_strokes(strokes, self.size, self._raster, intensity)
+        near = None if reach is None else closeness(drawn.mask > 0, reach)
+        return Composed(drawn, near)
+
+    def _compose(self, lights: Sequence[Light], intensity: float) -> Composed:
+        lights = [replace(one, strength=one.strength * intensity) for one in lights if one.on]
+        covers = [self._cover(light.drawn) for light in lights]
+        if not any(layer.coverage.any() for layer in covers):  # the source map is for those who need it
+            nothing = np.zeros((*self._raster, 3), np.float32)
+            return Composed(Strokes(nothing, nothing[..., 0]), None)
+        return compose(self._source_map, lights, covers)
+
+    def _cover(self, drawn: Strokes | tuple[Stroke, ...]) -> Cover:
+        """The layer on the light grid; kept, for most layers stay as they are while one is drawn."""
+        with self._lock:
+            for source, layer in self._covers:
+                if source is drawn:
+                    return layer
+        raster = drawn if isinstance(drawn, Strokes) else self._relighter._draw(drawn, self.size)
+        light, mask = read_strokes(raster)
+        if mask.shape != self._raster:
+            check_same_shape(mask.shape, self.size)
+        layer = cover(Strokes(light, mask), self._raster)
+        with self._lock:
+            self._covers = [(drawn, layer), *self._covers[: MOST_COVERS - 1]]
+        return layer
+
+
+def _to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)
+    return (np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _are_layers(lights: Drawing) -> TypeGuard[Sequence[Light]]:
+    """Tell layers from the other ways to draw. Raises InputError for a mixture."""
+    if not isinstance(lights, Sequence):
+        return False
+    layers = [isinstance(one, Light) for one in lights]
+    if any(layers) and not all(layers):
+        raise InputError("Give either strokes or lights, not both in one list.")
+    return any(layers)
 
 
 def _check_intensity(intensity: float) -> None:

@@ -23,9 +23,10 @@ from dior_rt.families import lumen
 from dior_rt.flow.sampler import draw_noise
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.grid import GridRule
+from dior_rt.training.lumen.checkpoint import load_lumen
 from dior_rt.training.lumen.completion import Strokes
 from dior_rt.training.lumen.config import PATCH
-from dior_rt.training.lumen.model import Lumen, load_lumen
+from dior_rt.training.lumen.model import Lumen
 from dior_rt.training.lumen.scene import Scene
 
 Weights = Literal["fp16", "fp32"]

@@ -14,17 +14,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from dior_rt.kernels.types import KernelError
-
-if TYPE_CHECKING:
-    from dior_rt.kernels.devices import Device
+from dior_rt.kernels.types import Device, KernelError
 
 #: Bytes that the cache's disk must have left, and a file may have: more than any kernel takes.
 ROOM = 64 << 20
 SECONDS = 120
-_CODE = "import sys; from dior_rt.kernels.probe import try_device; try_device(int(sys.argv[1]))"
+_CODE = "import sys; from dior_rt.kernels.trial import try_device; try_device(int(sys.argv[1]))"
 _INSIDE = "DIOR_RT_PROBE"
 
 
@@ -34,9 +30,8 @@ class DeviceCrashError(KernelError):
 
 def probe(device: Device) -> None:
     """Raise KernelError where a device cannot be used without danger; what crashes it is cleared once."""
-    if (
-        device.type != "cpu" or _INSIDE in os.environ
-    ):  # a GPU's driver compiles elsewhere, and keeps no such files
+    # The driver of a GPU compiles elsewhere, and keeps no such files.
+    if device.type != "cpu" or _INSIDE in os.environ:
         return
     folder = Path(os.environ["POCL_CACHE_DIR"])
     _check_room(device, folder)
@@ -56,18 +51,6 @@ def probe(device: Device) -> None:
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
     raise DeviceCrashError(f"opencl:{device.index} ({device.name}) ends the process that uses it ({how})")
-
-
-def try_device(index: int) -> None:
-    """Use a device as a picture of 8 bits does."""
-    from dior_rt.kernels.devices import list_devices
-    from dior_rt.kernels.opencl_ops import OpenCLOps
-    from dior_rt.kernels.selftest import self_test
-
-    with contextlib.suppress(
-        KernelError
-    ):  # what raises does no harm; it is found again where it is asked for
-        self_test(OpenCLOps(list_devices()[index]))
 
 
 def _try_elsewhere(device: Device) -> int:

@@ -72,6 +72,8 @@ def test_the_wheel_holds_every_part_and_nothing_else(wheel: Path) -> None:
             if file.suffix in (".py", ".cl") and "__pycache__" not in file.parts:
                 assert f"{package}/{file.relative_to(ROOT / folder).as_posix()}" in packed
     assert "dior_rt/py.typed" in packed
+    for file in (ROOT / "dior_rt/desk/page").iterdir():
+        assert f"dior_rt/desk/page/{file.name}" in packed
     assert any(name.endswith("licenses/LICENSE") for name in packed)
     assert "License-Expression: Apache-2.0" in metadata
     required = re.findall(r"^Requires-Dist: ([A-Za-z0-9_-]+)(?!.*extra ==)", metadata, re.MULTILINE)
@@ -127,6 +129,7 @@ def test_a_command_without_its_extra_names_the_extra(installed: Path, tmp_path: 
     cases = {
         ("export", "checkpoint", "-o", "bundle"): "export",
         ("train", "render", "--out", "scenes"): "train",
+        ("desk", "photo.jpg"): "desk",
     }
     for arguments, extra in cases.items():
         result = run(installed / "dior-rt", *arguments, cwd=tmp_path)

@@ -23,6 +23,7 @@ COMMANDS = {
     "batch": "batch",
     "estimate": "pictures",
     "sparsify": "pictures",
+    "desk": "desk",
     "devices": "about",
     "info": "about",
     "bench": "bench",

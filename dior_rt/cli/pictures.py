@@ -32,7 +32,8 @@ def relight(
         Path,
         typer.Argument(
             metavar="STROKES",
-            help="The light: an RGBA PNG, an RGB picture, a float EXR or NPY map, or a JSON list of strokes.",
+            help="The light: an RGBA PNG, an RGB picture, a float EXR or NPY map, a JSON list of strokes, or "
+            "a project of the light desk (.dior).",
         ),
     ],
     out: Annotated[
@@ -84,6 +85,8 @@ def relight(
       dior-rt relight photo.jpg warm.json --intensity 3 -o warm.tif
     One more lamp, and the rest of the photo as it is:
       dior-rt relight photo.jpg strokes.png --reach 0.1
+    The lights of a project of the light desk, as `dior-rt desk` exports them:
+      dior-rt relight photo.jpg photo.dior
     A picture whose black means "not drawn":
       dior-rt relight photo.jpg light.png --key black
     Fast, or within half a level of 255 of what all the steps would give:
@@ -101,10 +104,15 @@ def relight(
     from dior_rt.images.readers import default_form
     from dior_rt.images.sidecar import sidecar_path, write_sidecar
     from dior_rt.images.strokes import read_drawing
+    from dior_rt.project import SUFFIX, hash_file, read_project
 
     check_readable(photo, "photo")
     encoding = Encoding(quality, int(bits) if bits else None)
     out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or default_form(photo)}"), format)
+    project = read_project(strokes) if strokes.suffix.lower() == SUFFIX else None
+    if project:  # its settings hold unless the command line says otherwise
+        preset, steps = preset or project.settings.preset, steps or project.settings.steps
+        seed, intensity = seed or project.settings.seed, intensity * project.settings.intensity
     _refuse_same(out, photo, strokes)
     check_free(out, overwrite)
     if sidecar:
@@ -144,6 +152,8 @@ def relight(
         *filter(None, [relit.notice, relighter.ops_notice]),
         *lost,
     ]
+    if project and project.photo.sha256 not in ("", hash_file(photo)):
+        notices.append(f"{strokes} was drawn on another file than {photo}, of the same size.")
     if quiet:
         notices = []
     _report(out, picture.size, settings, watch.seconds | relit.seconds, relighter, notices, as_json)

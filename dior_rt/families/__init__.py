@@ -1,7 +1,8 @@
 """The model families: each turns a photo and strokes into network inputs, and network outputs into light.
 
-A bundle names its family. `mini`, `lumen` and `qwen` are built in. Any installed package can add a family with
-an entry point of the group `dior_rt.families`, whose value is a callable `(bundle, device, threads) -> Family`:
+A bundle names its family. `mini`, `lumen` and `qwen` are built in. Any installed package can add a family
+with an entry point of the group `dior_rt.families`, whose value is a callable
+`(bundle, device, threads) -> Family`:
 
     [project.entry-points."dior_rt.families"]
     watercolour = "my_package.family:Watercolour"

@@ -21,7 +21,7 @@ from dior_rt.bundle import Bundle
 from dior_rt.engine import Engine, open_engine
 from dior_rt.errors import BundleError
 from dior_rt.families import Mode
-from dior_rt.flow.sampler import Array, Condition, Velocity
+from dior_rt.flow.sampler import Array, Condition, Velocity, guide
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.kernels import Ops, Strokes
 from dior_rt.kernels.color import linear_to_srgb
@@ -108,8 +108,7 @@ class Lumen:
             return drawn
 
         def guided(x: Array, sigma: float) -> Array:
-            null = (x - own) / np.float32(sigma)
-            return null + np.float32(guidance) * (drawn(x, sigma) - null)
+            return guide((x - own) / np.float32(sigma), drawn(x, sigma), guidance)
 
         return guided
 
@@ -147,13 +146,13 @@ def bounced(light: Array, bounce: Array) -> Array:
 def blur(cells: Array, deviation: float) -> Array:
     """Blur (B, C, h, w) by a Gaussian of `deviation` cells; the border's weights are normalised."""
     down, across = (_gaussian(size, deviation) for size in cells.shape[2:])
-    return down @ cells @ across.T
+    return np.asarray(down @ cells @ across.T, np.float32)
 
 
 def _gaussian(size: int, deviation: float) -> Array:
     place = np.arange(size, dtype=np.float32)
     weights = np.exp(-0.5 * ((place[:, None] - place) / np.float32(deviation)) ** 2)
-    return weights / weights.sum(axis=1, keepdims=True)
+    return (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def _planes(pixels: Array) -> Array:

@@ -7,13 +7,15 @@
                    has it
     map.npy        float (H, W, 3) linear light, or (H, W, 4) with the mask 0..1 as the fourth channel
     strokes.json   strokes as lines: [stroke, ...] or {"size": [width, height], "strokes": [stroke, ...]}
+    project.dior   the lights of a project of the light desk: see `dior_rt.project`
 
 Light has the primaries that its file names (an ICC profile, an EXR's chromaticities), else those of sRGB,
 and is converted to the photo's own in linear light.
 
 A stroke in JSON is {"points": [[x, y], ...], "width": pixels} and, where wanted, "color": "#rrggbb" (sRGB) or
-[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1. Coordinates are pixels of "size", or else
-of the photo as it is seen; (0, 0) is the upper left corner.
+[r, g, b] (linear), "intensity": any number >= 0, "softness": 0..1, "blend": "set", "add" or "multiply", see
+`dior_rt.lights`. Coordinates are pixels of "size", or else of the photo as it is seen; (0, 0) is the upper
+left corner.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from itertools import chain
+from dataclasses import dataclass, field, replace
+from itertools import chain, groupby
+from operator import itemgetter
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, Literal
@@ -30,6 +33,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from dior_rt import project
 from dior_rt.errors import InputError
 from dior_rt.files import check_readable, check_writable, reason, replacing
 from dior_rt.images.arrays import check_same_shape, convert_raster, convert_strokes
@@ -40,6 +44,7 @@ from dior_rt.images.primaries import Matrix, conversion, convert, srgb
 from dior_rt.kernels import NumpyOps, Stroke, Strokes
 from dior_rt.kernels.color import srgb_to_linear
 from dior_rt.kernels.types import FARTHEST
+from dior_rt.lights import BLENDS, Blend, Light
 from dior_rt.records import read_json
 
 Key = Literal["black"]
@@ -52,11 +57,13 @@ _MOST_JSON_BYTES = 16 << 20
 class DrawingFile:
     """strokes: as `Relighter.relight` takes them. notices: sentences about what their file could not say."""
 
-    strokes: NDArray | list[Stroke]
+    strokes: NDArray | list[Stroke] | list[Light]
     notices: tuple[str, ...] = ()
 
 
-def read_strokes(path: Path, photo_size: tuple[int, int], key: Key | None = None) -> NDArray | list[Stroke]:
+def read_strokes(
+    path: Path, photo_size: tuple[int, int], key: Key | None = None
+) -> NDArray | list[Stroke] | list[Light]:
     """The strokes of `read_drawing`, over a photo with sRGB's primaries."""
     return read_drawing(path, photo_size, key).strokes
 
@@ -73,12 +80,14 @@ def read_drawing(
     photo_size: (height, width) of the photo. key: "black" reads pixels that are exactly black as unspecified.
     page: which one is read of a file with several. primaries: the photo's own, None for sRGB's; light in
     others is converted. A raster comes as (H, W, 4): uint8 or uint16, sRGB-encoded, or float32, linear;
-    the last channel is the mask. JSON comes as strokes in the photo's pixels. Raises InputError for what
-    cannot be read or makes no sense.
+    the last channel is the mask. JSON comes as strokes in the photo's pixels, or as lights where any of
+    them blends; a project as its lights. Raises InputError for what cannot be read or makes no sense.
     """
+    if path.suffix.lower() == project.SUFFIX:
+        return DrawingFile(project.lights_of(project.read_project(path), photo_size))
     target = srgb() if primaries is None else primaries
     if path.suffix.lower() == ".json":
-        return DrawingFile(convert_strokes(_read_json(path, photo_size), conversion(srgb(), target)))
+        return DrawingFile(_convert_json(_read_json(path, photo_size), conversion(srgb(), target)))
     raster = _read_raster(path, "strokes", photo_size, page)
     pixels = raster.pixels
     if key == "black":
@@ -272,7 +281,7 @@ def _write_npy(path: Path, array: NDArray[np.float32]) -> None:
         np.save(file, array.astype(np.float32, copy=False), allow_pickle=False)
 
 
-def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke]:
+def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke] | list[Light]:
     check_readable(path, "strokes")
     try:
         document = read_json(path, _MOST_JSON_BYTES)
@@ -283,15 +292,42 @@ def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke]:
             document = document["strokes"]
         if not isinstance(document, list):
             raise ValueError("it must be a list of strokes")
-        strokes = []
+        strokes, blends = [], []
         for i, item in enumerate(document, 1):
             try:
                 strokes.append(_parse_stroke(item, scale))
+                blends.append(_blend(item))
             except (ValueError, OverflowError) as error:
                 raise ValueError(f"stroke {i}: {error}") from error
-        return strokes
+        return _layers(strokes, blends) if set(blends) - {"set"} else strokes
     except (OSError, ValueError, OverflowError) as error:
         raise InputError(f"Cannot read the strokes {path}: {reason(error)}.") from error
+
+
+def _convert_json(drawing: list[Stroke] | list[Light], change: Matrix | None) -> list[Stroke] | list[Light]:
+    """Strokes, or layers of them, in other primaries."""
+    layers = [one for one in drawing if isinstance(one, Light)]
+    if layers:
+        return [replace(one, drawn=tuple(convert_strokes(list(_lines(one)), change))) for one in layers]
+    return convert_strokes([one for one in drawing if isinstance(one, Stroke)], change)
+
+
+def _lines(light: Light) -> tuple[Stroke, ...]:
+    assert isinstance(light.drawn, tuple)
+    return light.drawn
+
+
+def _blend(item: dict[str, Any]) -> Blend:
+    blend = item.get("blend", "set")
+    if blend not in BLENDS:
+        raise ValueError(f"blend must be one of {', '.join(BLENDS)}, not {blend!r:.40}")
+    return blend
+
+
+def _layers(strokes: list[Stroke], blends: list[Blend]) -> list[Light]:
+    """Strokes that follow one another with the same blend are one layer."""
+    runs = groupby(zip(blends, strokes, strict=True), key=itemgetter(0))
+    return [Light(tuple(stroke for _, stroke in run), blend) for blend, run in runs]
 
 
 def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
@@ -312,7 +348,7 @@ def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
 def _parse_stroke(item: Any, scale: tuple[float, float]) -> Stroke:
     if not isinstance(item, dict):
         raise ValueError("it must be an object with points and a width")
-    _check_keys(item, known={"points", "width", *_OPTIONAL}, needed={"points", "width"})
+    _check_keys(item, known={"points", "width", "blend", *_OPTIONAL}, needed={"points", "width"})
     if not isinstance(item["points"], list):
         raise ValueError("points must be a list of [x, y]")
     points = _points(item["points"])

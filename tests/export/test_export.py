@@ -158,6 +158,7 @@ def test_the_probe_is_what_torch_answers(exported, rounded, name, part):
         np.testing.assert_allclose(array, arrays[output], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
     save_network(network, tmp_path / "model.safetensors")
     torch.manual_seed(1)
@@ -170,6 +171,7 @@ def test_a_checkpoint_with_a_lora_becomes_a_bundle(network, recipe, tmp_path):
     assert relative_error(run(open_graphs(bundle), feeds), evaluate(adapted.eval(), feeds)) < 1e-5
 
 
+@pytest.mark.slow
 def test_int8_multiplies_in_integers_and_stays_near(network, recipe, tmp_path):
     """Its self-test holds devices to the CPU's answers; its parity says how far those are from torch's."""
     bundle = export_network(network, recipe, tmp_path / "b", weights="int8")
@@ -217,6 +219,7 @@ def test_a_graph_that_differs_fails_after_all_steps(exported, rounded, recipe):
         check_sampling(spoiled(rounded, by=0.2), graphs, recipe.grid, sigmas, 2.0, EXACT)
 
 
+@pytest.mark.slow
 def test_an_export_over_the_bar_leaves_nothing_behind(exported, network, recipe, tmp_path, monkeypatch):
     # The graph of other weights stands in for one that was converted wrongly.
     monkeypatch.setattr(export, "convert", lambda _, path, __: shutil.copy(exported.folder / path.name, path))

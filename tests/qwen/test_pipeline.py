@@ -18,9 +18,10 @@ from dior_rt.errors import InputError
 from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.errors import probe_strokes, psnr, relative
 from dior_rt.export.qwen.lora import Lora
-from dior_rt.families.qwen.model import Qwen, pack, rescaled, unpack
+from dior_rt.families.qwen.model import Qwen, rescaled
 from dior_rt.flow.sampler import draw_noise, sample
 from dior_rt.kernels import Strokes
+from dior_rt.light import pack_patches, unpack_patches
 
 PROMPT = "light it from the left"
 
@@ -179,9 +180,9 @@ def test_weights_that_memory_cannot_hold_give_the_same_picture(make):
 
 def test_tokens_and_latents_are_each_others_inverse():
     latents = np.random.default_rng(0).standard_normal((1, 4, 6, 10), dtype=np.float32)
-    tokens = pack(latents, 2)
+    tokens = pack_patches(latents, 2)
     assert tokens.shape == (15, 16)
-    np.testing.assert_array_equal(unpack(tokens, (3, 5), 2), latents)
+    np.testing.assert_array_equal(unpack_patches(tokens, (3, 5), 2), latents)
     packed = edit_plus.QwenImageEditPlusPipeline._pack_latents(torch.from_numpy(latents), 1, 4, 6, 10)
     np.testing.assert_array_equal(tokens, packed[0].numpy())
 

@@ -16,12 +16,13 @@ from dior_rt.export.qwen.bundle import export_qwen
 from dior_rt.export.qwen.lora import Lora
 from dior_rt.families.mini import MODES
 from dior_rt.families.qwen.model import Qwen
-from dior_rt.families.qwen.settings import LUMI_PEAK
 from dior_rt.kernels import NumpyOps, Strokes
+from dior_rt.light import LUMI_PEAK
 from dior_rt.training import qwen as training
 from dior_rt.training.data.render import View
 from dior_rt.training.data.triplets import Batches, load_views
 from dior_rt.training.fit import Plan, flow_loss
+from dior_rt.training.light import draw_lumi, pack_patches, undraw_lumi, unpack_patches
 from dior_rt.training.stage2 import MixedBatches, Mixture, fit_stage2, load_scenes, with_estimated_strokes
 
 SAID = {MODES["relight"]: "light it from the left", MODES["estimate"]: "draw its light"}
@@ -139,7 +140,7 @@ def test_training_and_runtime_see_the_same_pictures(qwens, prompts):
         "x0": torch.zeros_like(planes),
     }
     seen = pictures.prepare(batch)
-    tokens = torch.cat([training.pack(seen[name][0]) for name in ("photo", "light")]).numpy()
+    tokens = torch.cat([pack_patches(seen[name][0]) for name in ("photo", "light")]).numpy()
     # The runtime rounds the drawing of light to 8 bits.
     np.testing.assert_allclose(tokens[:36], condition.references[:36], atol=1e-4)
     assert np.abs(tokens[36:] - condition.references[36:]).max() < 0.05 * np.abs(tokens).max()
@@ -155,7 +156,7 @@ def test_training_and_runtime_ask_the_same_network(qwens, prompts):
     for mode, pictures in (("relight", [photo, light]), ("estimate", [photo])):
         with torch.no_grad():
             want = network(x, torch.tensor([0.5]), photo, light, None, torch.tensor([MODES[mode]]))
-        references = torch.cat([training.pack(picture[0]) for picture in pictures]).numpy()
+        references = torch.cat([pack_patches(picture[0]) for picture in pictures]).numpy()
         from dior_rt.families.qwen.frame import Frame
         from dior_rt.families.qwen.model import Condition
 
@@ -163,13 +164,13 @@ def test_training_and_runtime_ask_the_same_network(qwens, prompts):
         condition = Condition(mode, (64, 64), Frame.around((64, 64), 32), references, sizes, ())
         rows = qwens[True].modulation(np.array([0.5], np.float32))
         text = prompts[MODES[mode]].numpy()
-        got = qwens[True].predict(training.pack(x[0]).numpy(), condition, [text], rows)[0]
-        np.testing.assert_allclose(got, training.pack(want[0]).numpy(), atol=1e-4)
+        got = qwens[True].predict(pack_patches(x[0]).numpy(), condition, [text], rows)[0]
+        np.testing.assert_allclose(got, pack_patches(want[0]).numpy(), atol=1e-4)
 
 
 def test_tokens_are_unpacked_to_what_was_packed():
     latents = torch.randn(4, 6, 10)
-    assert torch.equal(training.unpack(training.pack(latents), 3, 5), latents)
+    assert torch.equal(unpack_patches(pack_patches(latents), (3, 5)), latents)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +223,7 @@ def test_stage_two_lowers_the_loss_on_real_pairs_it_has_not_drawn(
 
 def test_light_that_was_drawn_is_read_back():
     light = torch.rand(2, 3, 4, 4) * LUMI_PEAK
-    torch.testing.assert_close(training.undraw(training.draw(light)), light, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(undraw_lumi(draw_lumi(light)), light, rtol=1e-4, atol=1e-5)
 
 
 def test_latents_are_decoded_to_what_diffusers_paints():

@@ -1,9 +1,9 @@
-"""What was seen: every error that a test held to a bound, and the page of them.
+"""Collect every error that a test compares with a bound, and write the page of them.
 
     pytest tests/stability -m "slow or not slow" --numerics docs/numerics.md
 
-A test says `hold(case, where, got, want, bound)`: the result is finite, and its largest difference to the
-float64 reference, by `scale`, is at most the bound.
+A test calls `hold(case, where, got, want, bound)`: the result must be finite, and its largest difference to
+the float64 reference, divided by `scale`, at most the bound.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ COMMAND = 'pytest tests/stability -m "slow or not slow" --numerics docs/numerics
 
 @dataclass(frozen=True)
 class Entry:
-    """The worst error of a case in one setting. where: the device, the network's precision, or the solver.
-    shown: what is printed of it."""
+    """The worst error of a case in one setting.
+
+    where: the device, the network's precision, or the solver. shown: the text in the table.
+    """
 
     case: str
     where: str
@@ -39,7 +41,7 @@ class Entry:
 
 @dataclass
 class Ledger:
-    """The entries of every area, which is a test module; of one case and setting the worst is kept."""
+    """The worst entry of each case and setting, by area. An area is a test module."""
 
     areas: dict[str, dict[tuple[str, str], Entry]] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
@@ -53,7 +55,7 @@ class Ledger:
             area[entry.case, entry.where] = entry
 
     def page(self, old: str = "") -> str:
-        """The page in Markdown. Of an old one, the sections of areas that did not run are kept."""
+        """Return the page in Markdown. Sections of areas that did not run are kept from the old page."""
         parts = dict(part.split("\n", 1) for part in old.split("\n## ")[1:])
         for name, area in self.areas.items():
             title, _, text = self.texts[name].partition("\n")
@@ -64,9 +66,10 @@ class Ledger:
 
 HEAD = """# Numbers on hard cases
 
-Every case of `tests/stability`: its result is finite and in range, and its error against a float64 reference
-of the same computation stays within the bound. A cell is the largest error seen, then the bound in brackets;
-`exact` means that no difference is allowed and none was seen. This page is written by
+After reading this page you know how large the numerical errors are in extreme cases. In every case of
+`tests/stability`, the result is finite and in range, and its error against a float64 reference of the same
+computation is within the bound. A cell shows the largest error, then the bound in brackets. `exact` means
+that no difference is allowed, and none occurred. This page is written by
 
     {command}
 
@@ -75,7 +78,7 @@ on {machine}.
 
 
 def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
-    """`hold` for the tests of one module."""
+    """Return `hold` for the tests of one module."""
 
     def hold(
         case: str,
@@ -87,7 +90,7 @@ def holder(ledger: Ledger, module: ModuleType) -> Callable[..., None]:
         scale: npt.ArrayLike = 1.0,
         shown: str = "",
     ) -> None:
-        """Finite, and nowhere further from `want` than bound * scale; both are noted."""
+        """Check that the result is finite and within bound * scale of `want`, and note the error."""
         got, want = np.asarray(got), np.asarray(want)
         assert got.shape == want.shape, f"{case}: {got.shape} where {want.shape} is expected"
         assert np.isfinite(got).all(), f"{case}, {where}: the result is not finite"
@@ -124,6 +127,6 @@ def _machine() -> str:
 
 
 def write(ledger: Ledger, path: Path) -> None:
-    """Write the page, or what ran of it into the page that is there."""
+    """Write the page. If it exists, replace only the sections that ran."""
     old = path.read_text("utf-8") if path.exists() else ""
     path.write_text(ledger.page(old), encoding="utf-8")

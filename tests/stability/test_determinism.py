@@ -1,9 +1,9 @@
 """Determinism: one seed, one answer.
 
-On one device a picture's bytes are the same, run after run, for any number of threads; on another device
-they are at most 1/255 away. The velocity is the same for any number of threads, and on up to three of them
-the same alone and in a batch; on five, encode's first convolution is divided otherwise for a lone picture,
-and in int8 the range of a whole batch decides how activations are rounded.
+On one device, the bytes of a picture are the same in every run and for any number of threads. Another device
+differs by at most 1/255. The velocity is the same for any number of threads. On up to three threads it is
+also the same alone and in a batch. On five threads, encode's first convolution is divided differently for a
+single picture. In int8, the range of the full batch decides how activations are rounded.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Self-tests: a device whose results are finite but wrong is refused.
 
-The wrong devices are real: ONNX Runtime runs a graph with one fault, PoCL a kernel whose source or macro has
-one. Each is held to the CPU's answers: the bundle's probe, or the NumPy twin.
+The wrong devices are real: ONNX Runtime runs a graph with one fault, and PoCL runs a kernel with a fault in
+its source or its macros. Each is compared with the CPU: with the bundle's probe, or with NumPy.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Light: what is drawn, from nothing to everything.
 
-A photo of 44 x 60 pixels on a grid of some 256 cells. `light on the grid`: the masked mean that the network
-sees, against float64, relative to its own value. `picture`: the whole way from pixels to pixels, 2 steps,
-guidance 2, against the whole way in float64.
+A photo of 44 x 60 pixels on a grid of about 256 cells. `light on the grid` is the masked mean that the
+network sees, compared with float64, relative to its value. `picture` is the result of 2 steps with guidance
+2, compared with the same computation in float64.
 """
 
 from __future__ import annotations
@@ -92,6 +92,7 @@ def test_picture_on_every_device(relighter, ops, expected, hold, case):
     hold(f"{case}: picture", ops.name.split()[0], picture, expected[case], CODES["fp32"], "1/255")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("precision", ["fp16", "int8"])
 def test_picture_in_every_precision(relighter, expected, hold, precision, case):

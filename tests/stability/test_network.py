@@ -1,8 +1,8 @@
 """Network: the shipped graph and a block of the qwen family, in three precisions.
 
-Against ONNX's reference evaluator in float64. The velocity's error is relative to the row's largest value, at
-least 1; a block's to the norm of what it returns. fp16 and int8 of mini are ONNX Runtime's own conversions of
-the whole graph; those of qwen are this project's export.
+The networks are compared with ONNX's reference evaluator in float64. The error of the velocity is relative to
+the row's largest value, at least 1. The error of a block is relative to the norm of its output. fp16 and
+int8 of mini are ONNX Runtime's own conversions of the full graph; those of qwen are this project's export.
 """
 
 from __future__ import annotations

@@ -189,6 +189,7 @@ def losses_of(network: torch.nn.Module, unseen) -> list[float]:
         return [float(flow_loss(network, real, torch.ones(6), noise[:6])), float(whole)]
 
 
+@pytest.mark.slow
 def test_it_learns_and_goes_on_where_it_stopped(stage1, pairs, renders, unseen, tmp_path) -> None:
     plan = Plan(steps=48, batch=8, rate=1e-2, warmup=2, average=4, save_every=8)
     through, stopped, scenes = tmp_path / "through", tmp_path / "stopped", load_scenes(pairs)

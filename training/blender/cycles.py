@@ -113,7 +113,7 @@ class Studio:
     def shoot(self, camera: Camera, lamps: Sequence[Lamp]) -> Shot:
         """Render a camera's view under every lamp and the world, each alone."""
         self._light(lamps)
-        self._aim(camera)
+        self._point_camera(camera)
         groups = [f"L{k}" for k in range(len(lamps))] + ([WORLD] if self._world else [])
         for name in groups:
             if name not in self._layer.lightgroups:
@@ -147,7 +147,7 @@ class Studio:
             if k < len(lamps):
                 _set_lamp(placed, lamps[k])
 
-    def _aim(self, camera: Camera) -> None:
+    def _point_camera(self, camera: Camera) -> None:
         if self._scene.camera is None:
             self._scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
             self._scene.collection.objects.link(self._scene.camera)
@@ -169,13 +169,13 @@ class Studio:
         self._scene.render.film_transparent = paper
         path = Path(self._files.name) / f"{name}.exr"
         self._scene.render.filepath = str(path)
-        with _silent():
+        with _quiet():
             bpy.ops.render.render(write_still=True)
         return OpenEXR.File(str(path), separate_channels=True).channels()
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def _quiet() -> Iterator[None]:
     """Keep Blender's line a sample off the terminal; it writes past Python, to the process's own output."""
     sys.stdout.flush()
     shown, hidden = os.dup(1), os.open(os.devnull, os.O_WRONLY)
@@ -405,8 +405,10 @@ def _cut(data: Any, lamp: Lamp, gobo: Gobo) -> None:
     def step(value: Any, edge: float, width: float) -> Any:
         """0 below the edge, 1 above, smooth between."""
         node = nodes.add("ShaderNodeMapRange", interpolation_type="SMOOTHSTEP")
-        for socket, given in zip(node.inputs, (value, edge - width / 2, edge + width / 2), strict=False):
-            nodes.set(socket, given)
+        for socket, value_or_edge in zip(
+            node.inputs, (value, edge - width / 2, edge + width / 2), strict=False
+        ):
+            nodes.set(socket, value_or_edge)
         return node
 
     def inside(value: Any, half: float) -> Any:

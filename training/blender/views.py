@@ -63,8 +63,8 @@ def render_views(
 
     assets = Assets.open(job.assets)
     make_folder(job.out)
-    mine = numbers(job)
-    for done, number in enumerate(mine):
+    shard_numbers = numbers(job)
+    for done, number in enumerate(shard_numbers):
         stem = f"{job.split}-{number:09d}"
         finished = job.out / f"{stem}.done"
         if not finished.exists():
@@ -76,7 +76,7 @@ def render_views(
                 finished.touch()
             except OSError as error:
                 raise InputError(f"Cannot write {finished}: {error.strerror}.") from error
-        progress(done + 1, len(mine))
+        progress(done + 1, len(shard_numbers))
 
 
 def views(described: BlenderScene, studio: Studio, count: int) -> list[View]:

@@ -1,4 +1,4 @@
-"""The benchmarks in a folder, known by its layout.
+"""Find the benchmarks in a folder by its layout.
 
 renders      {scene}-{view}.npz of `dior-rt train render`
 RealBench    realbench.json and {pair}/ of `dior-rt train realbench`
@@ -26,11 +26,11 @@ from dior_rt.training.evaluation.layouts import multi_illum, read_picture, rene
 from dior_rt.training.evaluation.tasks import OPS, Benchmark, Task
 
 HEAD: Final = "synthbench.json"
-LAST: Final = "target.png"  # what is written last of a pair: where it is, the pair is whole
+LAST: Final = "target.png"  # the last file of a pair: a pair with it is complete
 
 
 def open_benchmarks(folder: Path) -> list[Benchmark]:
-    """The benchmarks in a folder, known by their layout. Raises InputError for a folder of none."""
+    """Return the benchmarks in a folder, recognised by their layout. Raises InputError if there are none."""
     for kind in (renders, realbench, synthbench, multi_illum, rene):
         if folder.is_dir() and (found := kind(folder)):
             return found
@@ -41,7 +41,8 @@ def open_benchmarks(folder: Path) -> list[Benchmark]:
 
 
 def renders(folder: Path, kinds: Sequence[str] = ("replace", "change"), seed: int = 1) -> list[Benchmark]:
-    """A pair of every kind from every view: triplets' kinds, and "add", where a light comes on."""
+    """Return a pair of every kind from every view: the kinds of triplets, and "add", where a light comes
+    on."""
     paths = sorted(folder.glob("*-*.npz"))
     if not paths:
         return []
@@ -65,7 +66,7 @@ def _rendered(path: Path, kind: str, number: int, seed: int) -> Task:
 
 
 def one_light_more(rng: Generator, view: View, draws: int = 64) -> Pair:
-    """A random pair of one changed light that nowhere takes light away. Raises InputError after `draws`."""
+    """Return a random pair with one changed light that only adds light. Raises InputError after `draws`."""
     for _ in range(draws):
         sample = pair(rng, view, "change")
         if (sample.target >= sample.source - 1e-3).all() and not np.array_equal(sample.target, sample.source):
@@ -74,12 +75,14 @@ def one_light_more(rng: Generator, view: View, draws: int = 64) -> Pair:
 
 
 def synthbench(folder: Path) -> list[Benchmark]:
-    """What `dior-rt train synthbench` made."""
+    """Return the pairs that `dior-rt train synthbench` made."""
     if not (folder / HEAD).is_file():
         return []
     pairs = sorted(path.parent for path in folder.glob(f"*/{LAST}"))
     if not pairs:
-        raise InputError(f"The SynthBench in {folder} has no pairs; go on with `dior-rt train synthbench`.")
+        raise InputError(
+            f"The SynthBench in {folder} has no pairs; render them with `dior-rt train synthbench`."
+        )
     load = tuple(partial(_synthesized, path, number) for number, path in enumerate(pairs))
     return [Benchmark("SynthBench", load, True)]
 

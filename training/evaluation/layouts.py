@@ -1,4 +1,4 @@
-"""Real pairs in the layouts in which they are published: one view, two lights, no true maps.
+"""Read published benchmarks of real pairs: one view, two lights, no true maps.
 
 MultiIllum   {scene}/dir_{0..24}_mip{m}.jpg or .exr, with probes and materials (Murmann et al. 2019);
              everett* are its test scenes
@@ -25,9 +25,9 @@ WHITE = 98  # the percentile of a scene's linear pictures that becomes display w
 
 
 def multi_illum(folder: Path) -> list[Benchmark]:
-    """Each direction of the flash as the target of the one half the list away, at the finest level there is.
+    """Return pairs of flash directions half the list apart, at the finest available level.
 
-    The scenes are everett*, the test set; a folder that is itself a scene is taken as it is.
+    The scenes are everett*, the test set. The folder may also be a single scene.
     """
     load = []
     for scene in (folder, *sorted(folder.glob("everett*"))):
@@ -41,16 +41,16 @@ def multi_illum(folder: Path) -> list[Benchmark]:
 
 
 def _directions(scene: Path) -> list[Path]:
-    """The pictures of the finest level, JPEG before EXR, by direction."""
+    """Return the pictures of the finest level by direction, JPEG before EXR."""
     found = [match for path in scene.iterdir() if (match := DIRECTION.fullmatch(path.name))]
     order = [(int(match[2]), match[3] == "exr", int(match[1]), match[0]) for match in found]
     return [scene / name for *level, _, name in sorted(order) if level == list(min(order)[:2])]
 
 
 def rene(folder: Path) -> list[Benchmark]:
-    """Each light set as the target of the one half the list away, by one camera, another for each set.
+    """Return pairs of light sets half the list apart, each from a different camera.
 
-    Pictures that are all black, as those of the published test set, are skipped.
+    Black pictures, such as those of the published test set, are skipped.
     """
     load = []
     for scene in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
@@ -66,7 +66,7 @@ def rene(folder: Path) -> list[Benchmark]:
 
 
 def _shared_camera(source: Path, target: Path, turn: int) -> str | None:
-    """The first picture, from the turn-th camera on, that both light sets have and that is not black."""
+    """Return the first picture from the turn-th camera on that both light sets have and that is not black."""
     names = sorted(path.name for path in target.glob("*_image.png") if (source / path.name).is_file())
     start = turn % max(len(names), 1)
     return next((n for n in names[start:] + names[:start] if _lit(source / n) and _lit(target / n)), None)
@@ -77,7 +77,7 @@ def _lit(path: Path) -> bool:
 
 
 def photographed(name: str, source: Path, target: Path, seed: int) -> Task:
-    """A pair of photos; linear ones share one exposure, under which neither is lost in white."""
+    """Read a pair of photos. Linear ones share an exposure under which neither is overexposed."""
     if source.suffix == ".exr":
         linear = [read_exr(path, "photo")[..., :3] for path in (source, target)]
         white = max(float(np.percentile(light.max(axis=2), WHITE)) for light in linear)
@@ -85,11 +85,11 @@ def photographed(name: str, source: Path, target: Path, seed: int) -> Task:
     else:
         before, after = read_picture(source), read_picture(target)
     if before.shape != after.shape:
-        raise InputError(f"{source} and {target} should be of one view, but their sizes differ.")
+        raise InputError(f"{source} and {target} should show one view, but their sizes differ.")
     return Task(name, before, after, seed=seed)
 
 
 def read_picture(path: Path) -> Photo:
-    """The (H, W, 3) 8-bit sRGB pixels of a picture. Raises InputError."""
+    """Return the 8-bit sRGB pixels (H, W, 3) of a picture. Raises InputError."""
     pixels = read_photo(path).pixels
     return pixels if pixels.dtype == np.uint8 else OPS.encode_srgb(OPS.decode_srgb(pixels), np.uint8)

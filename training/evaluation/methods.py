@@ -1,4 +1,4 @@
-"""What is evaluated: a bundle under some settings, or the pictures that another method left in a folder."""
+"""The evaluated methods: a bundle with settings, or the pictures of another method in a folder."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from dior_rt.training.evaluation.tasks import Task
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of the runtime; None takes the bundle's own, and of `reach` that the model decides.
+    """The settings of the runtime. None takes the bundle's; for `reach`, None means no limit.
 
-    Raises InputError for a reach that cannot be.
+    Raises InputError for an invalid reach.
     """
 
     steps: int | None = None
@@ -35,7 +35,7 @@ class Settings:
 
 
 class Model:
-    """A bundle by the runtime as people run it, one seed for all pictures. settings: as used."""
+    """A bundle in the runtime, with one seed for all pictures. settings: as used."""
 
     def __init__(self, relighter: Relighter, settings: Settings = Settings()) -> None:
         manifest = relighter.bundle.manifest
@@ -47,13 +47,13 @@ class Model:
         self.settings = Settings(used.steps, used.guidance, used.noise_scale, settings.reach)
 
     def relight(self, photo: Photo | Raster, strokes: Strokes) -> Photo:
-        """The photo, 8-bit or float sRGB, under the strokes; what comes back is of its dtype."""
+        """Return the photo, 8-bit or float sRGB, under the strokes, in the same dtype."""
         return np.asarray(
             self.relighter.relight(photo, strokes, self.options, reach=self.settings.reach).picture
         )
 
     def estimate(self, photo: Photo | Raster) -> Raster:
-        """The photo's own light on the light grid, (h, w, 3) linear."""
+        """Return the estimated source Lumi map on the light grid, (h, w, 3), linear."""
         return self.relighter.estimate(photo, self.options)
 
 
@@ -68,7 +68,7 @@ class Pictures:
         return self.folder.name
 
     def picture(self, task: Task) -> Photo:
-        """Raises InputError where it is missing or of another size than the truth."""
+        """Read a task's picture. Raises InputError if it is missing or of another size than the truth."""
         path = self.folder / f"{task.name}.png"
         picture = read_picture(path)
         if picture.shape != task.truth.shape:
@@ -78,7 +78,7 @@ class Pictures:
 
 
 def open_method(folder: Path, settings: Settings) -> Model | Pictures:
-    """A bundle under these settings, or a folder of pictures. Raises BundleError for one that is neither."""
+    """Open a bundle with settings, or a folder of pictures. Raises BundleError if the folder is neither."""
     if not (folder / MANIFEST).exists() and any(folder.glob("*.png")):
         return Pictures(folder)
     return Model(Relighter(folder), settings)

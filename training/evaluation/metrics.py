@@ -1,4 +1,4 @@
-"""Pictures and series of figures to numbers, by small pure functions. Pictures are 8-bit sRGB, as shown."""
+"""Measures of pictures and of series of figures, as pure functions. Pictures are 8-bit sRGB."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 Photo = NDArray[np.uint8]
 Raster = NDArray[np.float32]
 
-PERFECT: Final = 100.0  # dB; what equal pictures score
+PERFECT: Final = 100.0  # dB for equal pictures
 RESAMPLES: Final = 2000
-DARK: Final = 1e-4  # linear light below which a logarithm says nothing
+DARK: Final = 1e-4  # linear light below which a logarithm means nothing
 
 
 def mean_square(one: Photo, other: Photo) -> float:
-    """Of the differences, in 0..255 squared."""
+    """Return the mean squared difference, in 0..255 squared."""
     return float(np.square(one.astype(np.float64) - other).mean())
 
 
 def rmse(picture: Photo, truth: Photo) -> float:
-    """The root of the mean squared difference, in 0..255."""
+    """Return the root mean squared difference, in 0..255."""
     return float(np.sqrt(mean_square(picture, truth)))
 
 
 def decibels(square: float, peak: float = 255.0) -> float:
-    """10 log10(peak^2 / square), at most PERFECT."""
+    """Return 10 log10(peak^2 / square), at most PERFECT."""
     return float(10 * np.log10(peak**2 / max(square, peak**2 * 10 ** (-PERFECT / 10))))
 
 
 def psnr(picture: Photo, truth: Photo) -> float:
-    """In dB."""
+    """Return the peak signal-to-noise ratio in dB."""
     return decibels(mean_square(picture, truth))
 
 
@@ -47,9 +47,9 @@ def scale_invariant_psnr(picture: Photo, truth: Photo) -> float:
 
 
 def ssim(picture: Photo, truth: Photo) -> float:
-    """Structural similarity (Wang et al. 2004): scikit-image's, 7 x 7 windows, the mean over RGB.
+    """Return the structural similarity (Wang et al. 2004): scikit-image's, 7 x 7 windows, the mean over RGB.
 
-    Raises ValueError for pictures of less than 7 pixels a side.
+    Raises ValueError for pictures with a side below 7 pixels.
     """
     from skimage.metrics import structural_similarity
 
@@ -57,8 +57,10 @@ def ssim(picture: Photo, truth: Photo) -> float:
 
 
 def speckle(picture: Photo) -> float:
-    """The mean distance of a picture's pixels to the median of their 3 x 3 neighbours, in 0..255: its noise,
-    and its finest texture."""
+    """Return the mean distance of pixels to the median of their 3 x 3 neighbours, in 0..255.
+
+    It measures noise and the finest texture.
+    """
     from scipy.ndimage import median_filter
 
     codes = picture.astype(np.float64)
@@ -66,8 +68,10 @@ def speckle(picture: Photo) -> float:
 
 
 def interval(values: Sequence[float], level: float = 0.95, seed: int = 0) -> tuple[float, float]:
-    """The percentile bootstrap interval of the mean (Efron 1979): of the means of RESAMPLES resamples, the
-    inner `level`. Of one value, that value."""
+    """Return the percentile bootstrap interval of the mean (Efron 1979).
+
+    It is the inner `level` of the means of RESAMPLES resamples. For one value, both ends are that value.
+    """
     series = np.asarray(values, np.float64)
     drawn = np.random.default_rng(seed).integers(0, len(series), (RESAMPLES, len(series)))
     low, high = np.quantile(series[drawn].mean(axis=1), [(1 - level) / 2, (1 + level) / 2])
@@ -75,24 +79,24 @@ def interval(values: Sequence[float], level: float = 0.95, seed: int = 0) -> tup
 
 
 def log_slope(strengths: Sequence[float], light: Sequence[float]) -> float:
-    """The exponent p of the fit light = c * strength^p; 1 is light in proportion."""
+    """Return the exponent p of the fit light = c * strength^p; 1 is in proportion."""
     return float(np.polyfit(np.log(strengths), np.log(np.maximum(light, DARK)), 1)[0])
 
 
 def rising(values: Sequence[float]) -> bool:
-    """Whether every value exceeds the one before."""
+    """Return whether every value exceeds the one before."""
     return bool((np.diff(values) > 0).all())
 
 
 def angle(one: NDArray, other: NDArray) -> float:
-    """Degrees between two vectors; a vector without length is 90 degrees from all."""
+    """Return the degrees between two vectors. A vector without length is 90 degrees from all."""
     a, b = np.asarray(one, np.float64), np.asarray(other, np.float64)
     cosine = a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def hue_angle(one: NDArray, other: NDArray) -> float:
-    """Degrees between the hues of two RGB vectors: between their parts off the grey axis.
+    """Return the degrees between the hues of two RGB vectors: between their parts off the grey axis.
 
     A vector without hue is 90 degrees from all.
     """
@@ -100,24 +104,24 @@ def hue_angle(one: NDArray, other: NDArray) -> float:
 
 
 def leakage(before: Raster, after: Raster, drawn: NDArray[np.bool_], far: NDArray[np.bool_]) -> float:
-    """The change of linear light far from a stroke over that under it, both root mean squares; 0 is none.
+    """Return the change of linear light far from a stroke divided by that under it, both root mean squares.
 
-    before, after: (H, W, 3). drawn, far: (H, W), neither empty. Where nothing changes it is 0.
+    before, after: (H, W, 3). drawn, far: (H, W), neither empty. It is 0 if nothing changes.
     """
     change = np.square(after.astype(np.float64) - before).mean(axis=2)
     return float(np.sqrt(change[far].mean() / max(change[drawn].mean(), 1e-12)))
 
 
 def steps_not_worse(errors: Sequence[float], tolerance: float) -> float:
-    """The share of the steps along a series of errors that do not raise it by more than the tolerance."""
+    """Return the share of steps along a series of errors that raise it by no more than the tolerance."""
     return float((np.diff(errors) <= tolerance).mean())
 
 
 def border_ratio(light: Raster, patch: int) -> float:
-    """The mean absolute difference of neighbours across patch borders over that inside patches.
+    """Return the mean absolute difference of neighbours across patch borders, divided by that inside patches.
 
-    light (h, w, C) on the grid, whose sides are multiples of `patch` cells. A map in which borders are like
-    any other place scores 1, also a flat one.
+    light (h, w, C) on the grid, whose sides are multiples of `patch` cells. A map whose borders do not
+    stand out scores 1, also a flat one.
     """
     across, inside = [], []
     for axis in (0, 1):
@@ -129,10 +133,10 @@ def border_ratio(light: Raster, patch: int) -> float:
 
 
 def scaled_psnr(estimate: Raster, truth: Raster) -> float:
-    """In dB, of a Lumi map against the true one after the best global scale.
+    """Return the PSNR in dB of a Lumi map against the true one, after the best global scale.
 
     Both (h, w, 3), linear. The truth is exposed so that its 99th percentile is display white; then both are
-    compared as shown, in sRGB clipped to 0..1, with the scale of the estimate that leaves the least error.
+    compared in sRGB clipped to 0..1, with the scale of the estimate that minimises the error.
     """
     from scipy.optimize import minimize_scalar
 

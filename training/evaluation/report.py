@@ -1,4 +1,4 @@
-"""What was measured, for people and for programs: Markdown, JSON, and a contact sheet of pictures."""
+"""Write the results of an evaluation: Markdown, JSON, and a contact sheet of pictures."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from dior_rt.training.evaluation.metrics import Photo
 from dior_rt.training.evaluation.results import Control, Evaluation, Example, Figure, Row, Table
 from dior_rt.training.evaluation.tasks import OPS
 
-CELL: Final = 192  # pixels of a picture's longer side on the contact sheet
+CELL: Final = 192  # pixels of the longer side of a picture on the contact sheet
 GAP: Final = 6
 LINE: Final = 14  # height of a line of text
-UNSPECIFIED: Final = 128  # the grey of what strokes leave open
+UNSPECIFIED: Final = 128  # grey for places that strokes leave unspecified
 COLUMNS: Final = ("source", "strokes", "result", "truth")
-DECIMALS: Final = {"PSNR": 2, "RMSE": 1}  # three for all others
+DECIMALS: Final = {"PSNR": 2, "RMSE": 1}  # three digits for all others
 
 
 def write_report(folder: Path, evaluation: Evaluation, examples: Sequence[Example]) -> None:
-    """report.json, report.md and contact.png, each whole or not at all. Raises InputError."""
+    """Write report.json, report.md and contact.png, each complete or not at all. Raises InputError."""
     make_folder(folder)
     for name, text in (("report.json", as_json(evaluation)), ("report.md", markdown(evaluation))):
         with replacing(folder / name) as file:
@@ -36,12 +36,12 @@ def write_report(folder: Path, evaluation: Evaluation, examples: Sequence[Exampl
 
 
 def as_json(evaluation: Evaluation) -> str:
-    """Every figure, unrounded."""
+    """Return every figure, unrounded."""
     return json.dumps(asdict(evaluation), indent=2)
 
 
 def markdown(evaluation: Evaluation) -> str:
-    """Tables, each mean with its 95 % interval, and what the brush does in a few lines."""
+    """Return tables of means with 95 % intervals, and a few lines about the brush."""
     return "\n\n".join(_sections(evaluation))
 
 
@@ -111,7 +111,7 @@ def _control(control: Control) -> Iterator[str]:
 
 
 def contact_sheet(examples: Sequence[Example]) -> Image.Image:
-    """A row a task: source, strokes (grey where unspecified), result, truth."""
+    """Return a row per task: source, strokes (grey where unspecified), result, truth."""
     rows = [[_cell(picture) for picture in _pictures(example)] for example in examples]
     height = LINE + sum(row[0].height + LINE + GAP for row in rows)
     sheet = Image.new("RGB", (len(COLUMNS) * (CELL + GAP) + GAP, height), "white")
@@ -127,7 +127,7 @@ def contact_sheet(examples: Sequence[Example]) -> Image.Image:
 
 
 def _cell(picture: Photo) -> Image.Image:
-    """A picture that fits a cell: smaller ones a whole number of times as large."""
+    """Return a picture that fits a cell. Smaller pictures are enlarged by a whole factor."""
     cell = Image.fromarray(picture)
     if (times := CELL // max(cell.size)) > 1:
         return cell.resize((times * cell.width, times * cell.height), Image.Resampling.NEAREST)

@@ -1,4 +1,4 @@
-"""A method over a benchmark: every picture scored beside the baselines."""
+"""Run a method on a benchmark, and score every picture beside the baselines."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MEASURES: Final[Mapping[str, Measure]] = {
     "RMSE": rmse,
     "SSIM": ssim,
 }
-EXAMPLES: Final = 8  # of a benchmark, for the contact sheet
+EXAMPLES: Final = 8  # per benchmark, for the contact sheet
 SECONDS: Final = "seconds"
 PHOTOS: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
@@ -54,8 +54,12 @@ class Answer:
 
 @dataclass(frozen=True)
 class Plan:
-    """views: pairs of each kind at most. dabs: views that the brush visits, on renders. lpips: whether to
-    measure it. photos: a folder of pictures in which to look for patch borders."""
+    """What to measure.
+
+    views: the most pairs of each kind. dabs: how many views of renders the brush visits. lpips: whether to
+    measure it.
+    photos: a folder of pictures in which to measure patch borders.
+    """
 
     views: int = 80
     dabs: int = 10
@@ -66,8 +70,8 @@ class Plan:
 def evaluate(
     folder: Path, benchmark: Path, settings: Settings, plan: Plan
 ) -> tuple[Evaluation, list[Example]]:
-    """A bundle under these settings, or the pictures of another method. Raises what reading raises."""
-    benchmarks = open_benchmarks(benchmark)  # before what takes its time to load
+    """Evaluate a bundle with settings, or the pictures of another method. Raises the errors of reading."""
+    benchmarks = open_benchmarks(benchmark)  # before anything slow is loaded
     method = open_method(folder, settings)
     measures = dict(MEASURES)
     if plan.lpips:
@@ -86,7 +90,7 @@ def evaluate(
 def run(
     method: Model | Pictures, benchmark: Benchmark, measures: Mapping[str, Measure] = MEASURES
 ) -> tuple[Table, list[Example]]:
-    """The table of one benchmark, and its first EXAMPLES. Tasks come and go one by one."""
+    """Return the table of one benchmark and its first EXAMPLES. Only one task is in memory at a time."""
     scores: dict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
     estimates: list[float] = []
     examples: list[Example] = []
@@ -100,7 +104,7 @@ def run(
                 figures[SECONDS] = answer.seconds
             scores[answer.method, answer.control].append(figures)
         if len(examples) < EXAMPLES:
-            examples.append(Example(task, answer.strokes, answer.picture))  # of the last, the method's own
+            examples.append(Example(task, answer.strokes, answer.picture))  # of the method
     rows = tuple(_row(*key, figures) for key, figures in scores.items())
     light = TRUE_CONTROL if benchmark.true_maps else ESTIMATED_CONTROL
     estimate = Figure.of(estimates) if estimates else None
@@ -108,7 +112,7 @@ def run(
 
 
 def run_control(model: Model, folder: Path, views: int, dabs: int) -> Control | None:
-    """How a model answers to the brush, which visits `dabs` views; None where there are no renders."""
+    """Measure the response to the brush on `dabs` views. Return None without renders."""
     if not dabs or not renders(folder):
         return None
     still, changed, kept, added = (
@@ -130,14 +134,14 @@ def run_control(model: Model, folder: Path, views: int, dabs: int) -> Control | 
 
 
 def run_borders(model: Model, photos: Sequence[Path]) -> control.Borders:
-    """Over photos. Raises InputError where the model has no light grid."""
+    """Measure patch borders on photos. Raises InputError if the model has no light grid."""
     if model.grid is None:
-        raise InputError(f"{model.name} predicts no light grid, so it has no patch borders to look for.")
+        raise InputError(f"{model.name} predicts no light grid, so it has no patch borders to measure.")
     return control.borders(model.relight, model.estimate, model.grid, map(read_picture, photos))
 
 
 def list_photos(folder: Path) -> list[Path]:
-    """The pictures of a folder. Raises InputError where there are none."""
+    """Return the pictures of a folder. Raises InputError if there are none."""
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTOS)
     if not paths:
         raise InputError(f"There are no pictures in {folder}.")
@@ -151,7 +155,7 @@ def _row(method: str, drawn: str, scored: list[dict[str, float]]) -> Row:
 
 
 def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> Iterator[Answer]:
-    """The baselines, then the method."""
+    """Yield the answers of the baselines, then those of the method."""
     yield Answer("copy", "", task.source)
     yield Answer("gain", "target's colours", gain(task.source, task.truth))
     yield Answer("mean and deviation", "target's colours", match(task.source, task.truth))
@@ -175,7 +179,7 @@ def _answers(method: Model | Pictures, task: Task, estimated: Task | None) -> It
 
 
 def _estimated(model: Model, task: Task) -> Task:
-    """The task with the light that the model sees in its two pictures, on the light grid."""
+    """Return the task with the maps that the model estimates from its two pictures, on the light grid."""
     source, target = model.estimate(task.source), model.estimate(task.truth)
     return replace(task, source_lumi=source, target_lumi=target, mask=None, interest=None, strokes=None)
 

@@ -1,4 +1,4 @@
-"""What a benchmark is made of: pairs of pictures, and what is known of their light."""
+"""The parts of a benchmark: pairs of pictures, and their known light."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ DRAWN: Final[tuple[Drawn, ...]] = ("dense", "strokes")
 
 @dataclass(frozen=True)
 class Task:
-    """One pair of a benchmark, and what is known of its light.
+    """One pair of a benchmark, with its known light.
 
     source, truth: (H, W, 3) 8-bit sRGB. source_lumi, target_lumi: (h, w, 3) linear Lumi maps, of the
-    pictures' size if true, of the light grid if estimated, or None. mask: (h, w), where the benchmark's own
-    strokes speak. Without it they are cut out of the target's map: seed and `interest` (h, w) say where.
-    strokes: the benchmark's own, in place of a mask.
+    pictures' size if true, of the light grid if estimated, or None. mask: (h, w), the places of the
+    benchmark's strokes. Without it, strokes are cut from the target's map at places decided by seed and
+    `interest` (h, w).
+    strokes: the benchmark's strokes, in place of a mask.
     """
 
     name: str
@@ -37,7 +38,7 @@ class Task:
     strokes: Strokes | None = None
 
     def control(self, drawn: Drawn) -> Strokes:
-        """The target's map, whole, or strokes cut out of it."""
+        """Return the target's full map, or strokes cut from it."""
         assert self.target_lumi is not None
         if drawn == "dense":
             return Strokes(self.target_lumi, np.ones(self.target_lumi.shape[:2], np.float32))
@@ -50,8 +51,11 @@ class Task:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """name: of its table. load: its tasks, each read when it is wanted. true_maps: whether they come with
-    true Lumi maps; without, the control is estimated from the target."""
+    """A set of tasks.
+
+    name: the title of its table. load: functions that read each task. true_maps: whether the tasks have
+    true Lumi maps; without them, the control is estimated from the target.
+    """
 
     name: str
     load: tuple[Callable[[], Task], ...]
@@ -64,5 +68,5 @@ class Benchmark:
         return len(self.load)
 
     def first(self, count: int | None) -> Benchmark:
-        """Its first tasks."""
+        """Return the benchmark with its first tasks only."""
         return replace(self, load=self.load[:count])

@@ -64,6 +64,7 @@ def fit_command(
     backbone: Annotated[
         Path | None, typer.Option(help="ImageNet weights to start the features from.")
     ] = None,
+    start: Annotated[Path | None, typer.Option(help="Checkpoint of another run to go on from.")] = None,
     surfaces: Annotated[
         Path | None, typer.Option(help="Folder of surface sheets, for new materials.")
     ] = None,
@@ -84,7 +85,7 @@ def fit_command(
         print(f"{step:6d} {100 * done:5.1f}% {time.monotonic() - start:6.1f} s  {shown}", flush=True)
 
     try:
-        fit(packs, out, config, sizes, backbone, surfaces, progress)
+        fit(packs, out, config, sizes, backbone, surfaces, start, progress)
     except DiorError as error:
         print(error)
         raise typer.Exit(2) from error

@@ -42,7 +42,7 @@ ORIENTATION: Final = 4
 STATE: Final = 3  # channels of the flow's state
 SCENE: Final = 3 + 3 + 1 + 1 + 3  # photo, normal, depth, sky, light
 MODES: Final = 6  # three blends, each with or without light far from the strokes
-MURK: Final = 0.1  # noise ten times as strong as the image hides half of the state
+HIDING_RATIO: Final = 0.1  # noise ten times as strong as the image hides half of the state
 HOLD: Final = 0.03  # of the grid's side: how finely the drawn value holds
 EDGE: Final = 0.2  # share of drawn cells around one at which half of the correction is left
 FACTOR_SCALE: Final = 1 / 2.0  # of a log factor in the flow's data variable
@@ -109,8 +109,8 @@ class LightNetwork(nn.Module):
         half = self.to_half(fine, scene.half)  # (B, half, H / 2, W / 2)
         quarter = self.to_quarter(half, scene.quarter)  # (B, quarter, H / 4, W / 4)
         grid = self.to_tokens(quarter, scene.tokens)  # (B, width, H / 8, W / 8)
-        heard = 1 - (1 - sigma) * clear  # where the state says nothing, neither does the time
-        condition = F.silu(self.time(waves(heard, self.config.width)) + self.mode(mode))
+        visible_time = 1 - (1 - sigma) * clear  # where the state says nothing, neither does the time
+        condition = F.silu(self.time(waves(visible_time, self.config.width)) + self.mode(mode))
         modulation = self.modulation(condition).unflatten(1, (6, -1))  # (B, 6, width)
         tokens = grid.flatten(2).transpose(1, 2)
         turns = rotations(rows, columns, self.config.width // self.config.heads, photo.device)
@@ -180,5 +180,5 @@ def held(error: Tensor, mask: Tensor) -> Tensor:
 
 def clarity(sigma: Tensor) -> Tensor:
     """(B,) in 0..1: how far a state is looked at. Next to noise it can say nothing of the answer."""
-    image, noise = (1 - sigma) ** 2, (MURK * sigma) ** 2
+    image, noise = (1 - sigma) ** 2, (HIDING_RATIO * sigma) ** 2
     return image / (image + noise)

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Final
 
 import torch
-from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from dior_rt.errors import InputError
 from dior_rt.files import make_folder, reason, replacing
 from dior_rt.training.lumen.backbone import load_imagenet
 from dior_rt.training.lumen.batches import Batch, BatchMaker
+from dior_rt.training.lumen.checkpoint import AVERAGE, INDEX, STATE, load_lumen, read_parts, write_parts
 from dior_rt.training.lumen.config import LumenConfig
 from dior_rt.training.lumen.loss import loss
 from dior_rt.training.lumen.materials import load_tiles
@@ -26,11 +26,10 @@ from dior_rt.training.lumen.model import Lumen
 from dior_rt.training.lumen.pack import load_shards
 
 SIZES: Final = LumenConfig()
-PART: Final = 15_000_000  # bytes of a file of a checkpoint
 WARM_UP: Final = 0.04
 DECAY: Final = 0.35
 BACKBONE_RATE: Final = 0.25  # of the rate: pretrained weights move less
-AVERAGE: Final = 0.06  # the time constant of the weights' average, as a share of the run
+AVERAGED: Final = 0.06  # the time constant of the weights' average, as a share of the run
 
 
 @dataclass(frozen=True)
@@ -92,15 +91,21 @@ def fit(
     sizes: LumenConfig = SIZES,
     backbone: Path | None = None,
     surfaces: Path | None = None,
+    start: Path | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Train on the shards in `packs`; the folder `out` receives the state in parts and resumes from it."""
+    """Train on the shards in `packs`; the folder `out` receives the state in parts and resumes from it.
+
+    sizes: of a new network. start: the checkpoint of another run to go on from instead, with a new schedule.
+    backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new materials.
+    Raises InputError for files that cannot be used, and where training diverges.
+    """
     make_folder(out)
     torch.manual_seed(config.seed)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
-    network = Lumen(sizes)
+    network = load_lumen(start).train() if start is not None else Lumen(sizes)
     if backbone is not None:
         load_imagenet(network.scene.backbone, backbone)
     network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -188,10 +193,10 @@ def clip(weights: list[nn.Parameter], largest: float) -> Tensor:
 def clock_share(clock: Clock, first: int) -> float:
     """By how much the average moves towards the weights in one step."""
     if clock.config.minutes is None:
-        return 1 / (AVERAGE * clock.config.steps)
+        return 1 / (AVERAGED * clock.config.steps)
     steps = clock.step - first + 1
     total = max(steps / max(clock.done, 1e-3), 50.0)
-    return 1 / (AVERAGE * total)
+    return 1 / (AVERAGED * total)
 
 
 def make_optimizer(network: Lumen, config: FitConfig) -> torch.optim.Optimizer:
@@ -256,8 +261,6 @@ def has_bf16(device: torch.device) -> bool:
 
 # The state of a run: files of at most PART bytes, and an index.
 
-INDEX: Final = "state.json"
-
 
 def store(
     out: Path, network: Lumen, average: list[Tensor], optimizer: torch.optim.Optimizer, clock: Clock
@@ -266,11 +269,8 @@ def store(
     names = [name for name, _ in network.named_parameters()]
     tensors: dict[str, Tensor] = {}
     for name, mean in zip(names, average, strict=True):
-        tensors[f"average.{name}"] = mean.half()
-    write_parts(out, "average", tensors)
-    head = {"step": clock.step, "spent": clock.spent, "config": network.config.__dict__}
-    with replacing(out / INDEX) as file:
-        file.write(json.dumps(head).encode())
+        tensors[name] = mean.half()
+    write_parts(out, AVERAGE, tensors)
     state: dict[str, Tensor] = {}
     for (name, weight), _ in zip(network.named_parameters(), names, strict=True):
         state[f"weight.{name}"] = weight.detach()
@@ -279,34 +279,10 @@ def store(
             moments["exp_avg"].bfloat16(),
             moments["exp_avg_sq"].bfloat16(),
         )
-    write_parts(out, "state", state)
-
-
-def write_parts(out: Path, name: str, tensors: dict[str, Tensor]) -> None:
-    """Write tensors as `name-00.safetensors` and so on, each of at most PART bytes."""
-    part: dict[str, Tensor] = {}
-    size = number = 0
-    for key, tensor in tensors.items():
-        here = tensor.numel() * tensor.element_size()
-        if part and size + here > PART - 100_000:
-            _write(out / f"{name}-{number:02d}.safetensors", part)
-            part, size, number = {}, 0, number + 1
-        part[key] = tensor.detach().cpu().contiguous()
-        size += here
-    _write(out / f"{name}-{number:02d}.safetensors", part)
-
-
-def _write(path: Path, tensors: dict[str, Tensor]) -> None:
-    with replacing(path) as file:
-        file.write(save(tensors))
-
-
-def read_parts(out: Path, name: str) -> dict[str, Tensor]:
-    """Read what `write_parts` wrote."""
-    tensors: dict[str, Tensor] = {}
-    for path in sorted(out.glob(f"{name}-*.safetensors")):
-        tensors |= load_file(path)
-    return tensors
+    write_parts(out, STATE, state)
+    head = {"step": clock.step, "spent": clock.spent, "config": network.config.__dict__}
+    with replacing(out / INDEX) as file:
+        file.write(json.dumps(head).encode())
 
 
 def resume(
@@ -315,11 +291,11 @@ def resume(
     """Take up what `store` wrote, on any device. Without the state's files, start from the average."""
     try:
         head = json.loads((out / INDEX).read_text())
-        means, state = read_parts(out, "average"), read_parts(out, "state")
+        means, state = read_parts(out, AVERAGE), read_parts(out, STATE)
         with torch.no_grad():
             for (name, weight), mean in zip(network.named_parameters(), average, strict=True):
-                mean.copy_(means[f"average.{name}"])
-                weight.copy_(state.get(f"weight.{name}", means[f"average.{name}"]))
+                mean.copy_(means[name])
+                weight.copy_(state.get(f"weight.{name}", means[name]))
                 if f"first.{name}" in state:
                     first, second = (
                         torch.empty_like(weight).copy_(state[f"{k}.{name}"]) for k in ("first", "second")

@@ -164,6 +164,7 @@ def test_maps_are_refused_for_a_view_of_another_scene(views) -> None:
         with_maps(views[1], camera=0, samples=2)
 
 
+@pytest.mark.slow
 def test_a_folder_of_maps_is_made_once_and_whole(renders, tmp_path) -> None:
     seen = []
     render_maps(renders, tmp_path, 1, first=1, samples=2, progress=lambda *step: seen.append(step))

@@ -74,7 +74,7 @@ def test_nothing_changes_where_the_light_is_kept(batch: batches.Batch) -> None:
 def test_a_local_lamp_spares_the_wall_behind(views: Views) -> None:
     """A dab on the ball changes the ball more than the wall at the same distance in the picture."""
     inside, outside = [], []
-    for number in range(6):
+    for number in range(4):
         batch = BatchMaker(views, COUNT, seed=5).make(number)
         change = (batch.truth.target - batch.truth.light).abs().amax(dim=1)
         ball = batch.truth.depth[:, 0] < np.log(3.9)
@@ -90,7 +90,7 @@ def test_a_local_lamp_spares_the_wall_behind(views: Views) -> None:
             if int((near & ball[k]).sum()) > 10 and int((near & wall[k]).sum()) > 10:
                 inside.append(float(change[k][near & ball[k]].mean()))
                 outside.append(float(change[k][near & wall[k]].mean()))
-    assert len(inside) >= 5
+    assert len(inside) >= 4
     assert np.mean(outside) < 0.5 * np.mean(inside)
 
 

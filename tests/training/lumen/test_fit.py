@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from dior_rt.training.lumen.checkpoint import PART, load_lumen, read_parts, write_parts
 from dior_rt.training.lumen.config import LumenConfig
-from dior_rt.training.lumen.fit import PART, FitConfig, fit, read_parts, write_parts
+from dior_rt.training.lumen.fit import FitConfig, fit
 
 torch = pytest.importorskip("torch")
 TINY = LumenConfig(width=32, heads=1, scene_depth=1, light_depth=1, fine=16, half=16, quarter=16)
@@ -34,6 +35,7 @@ def test_a_run_goes_on_where_it_stopped(shards: Path, tmp_path: Path) -> None:
         shards, out, FitConfig(steps=5, batch=2), TINY, progress=lambda step, done, errors: steps.append(step)
     )
     assert steps == [4, 5]
+    assert load_lumen(out).config == TINY
 
 
 def test_parts_stay_small(tmp_path: Path) -> None:

@@ -242,6 +242,7 @@ def test_what_goes_on_sees_the_batches_after_those_before_it(views) -> None:
     assert list(shared.after(plans, FEW[2])(2, 0)) == []
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_measured(renders, tmp_path, capfd, monkeypatch) -> None:
     small = {"small": TINY, "recipes": (replace(FEW[0], walks=(ONCE,)), FEW[4])}
     for name in ("study", "total_steps"):

@@ -24,9 +24,9 @@ def identity(models: Sequence[Judged], subjects: Sequence[Subject]) -> Table:
     for model in models:
         scores: dict[str, list[float]] = {f"PSNR {mode}": [] for mode in ("strokes", "coarse", "dense")}
         for seed, subject in enumerate(subjects):
-            own = model.estimate(subject.photo)
+            estimated = model.estimate(subject.photo)
             for mode in MODES:
-                relit = model.relight(subject.photo, OPS.sparsify(own, mode, seed))
+                relit = model.relight(subject.photo, OPS.sparsify(estimated, mode, seed))
                 scores[f"PSNR {mode}"].append(psnr(relit, subject.photo))
         figures = {name: Figure.of(values) for name, values in scores.items()}
         rows.append(Row(model.name, "", figures, None))

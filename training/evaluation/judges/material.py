@@ -35,11 +35,11 @@ def material_figures(model: Judged, subjects: Sequence[Subject]) -> dict[str, Fi
     """Return the slopes of log chroma and log luminance, and R^2 to the blur formula."""
     chroma, luminance, explained = [], [], []
     for subject in subjects:
-        own = model.estimate(subject.photo)
-        photo = OPS.reduce_photo(subject.photo, own.shape[:2])
-        chroma.append(_products(log_chroma(photo), log_chroma(own)))
-        luminance.append(_products(log_luminance(photo), log_luminance(own)))
-        explained.append(squared_correlation(np.log(own + E), np.log(blur_formula(photo) + E)))
+        estimated = model.estimate(subject.photo)
+        photo = OPS.reduce_photo(subject.photo, estimated.shape[:2])
+        chroma.append(_products(log_chroma(photo), log_chroma(estimated)))
+        luminance.append(_products(log_luminance(photo), log_luminance(estimated)))
+        explained.append(squared_correlation(np.log(estimated + E), np.log(blur_formula(photo) + E)))
     return {
         "chroma slope": ratio_of_sums(*zip(*chroma, strict=True)),
         "luminance slope": ratio_of_sums(*zip(*luminance, strict=True)),

@@ -58,10 +58,10 @@ def drive(model: Judged, photo: Photo | Raster, strokes: Strokes, blend: Blend) 
     return model.relight(photo, as_set(strokes, model.estimate(photo), blend))
 
 
-def as_set(strokes: Strokes, own: Raster, blend: Blend) -> Strokes:
-    """Return strokes on the grid of `own` that set the light which `blend` makes of it."""
-    drawn = on_grid(strokes, own.shape[:2])
-    light = {"set": drawn.light, "add": own + drawn.light, "multiply": own * drawn.light}[blend]
+def as_set(strokes: Strokes, estimated: Raster, blend: Blend) -> Strokes:
+    """Return strokes on the grid of `estimated` that set the light which `blend` makes of it."""
+    drawn = on_grid(strokes, estimated.shape[:2])
+    light = {"set": drawn.light, "add": estimated + drawn.light, "multiply": estimated * drawn.light}[blend]
     return Strokes(np.where(drawn.mask[..., None] > 0, light, 0).astype(np.float32), drawn.mask)
 
 
@@ -125,10 +125,10 @@ class Glow:
             drawn = on_grid(strokes, grid)
             ratio = np.log(np.maximum(drawn.light, DARKEST_FACTOR))
         else:
-            own = self.estimate(photo)
-            grid = own.shape[:2]
-            drawn = as_set(strokes, own, blend)
-            ratio = np.log((drawn.light + E) / (own + E))
+            estimated = self.estimate(photo)
+            grid = estimated.shape[:2]
+            drawn = as_set(strokes, estimated, blend)
+            ratio = np.log((drawn.light + E) / (estimated + E))
         source = OPS.reduce_photo(photo, grid)
         relit = source * np.exp(spread(ratio, drawn.mask > 0))
         return OPS.transfer(photo, source, relit.astype(np.float32))
@@ -161,8 +161,8 @@ def spread(ratio: Raster, drawn: np.ndarray) -> Raster:
     """Return the log-ratio (h, w, 3) under `drawn` (h, w) carried on to everywhere; see `Glow`."""
     sigma = SPREAD * min(drawn.shape)
     weight = gaussian_filter(drawn.astype(np.float64), sigma, mode="constant", truncate=8)
-    known = np.where(drawn[..., None], ratio, 0).astype(np.float64)
-    total = gaussian_filter(known, (sigma, sigma, 0), mode="constant", truncate=8)
+    drawn_ratio = np.where(drawn[..., None], ratio, 0).astype(np.float64)
+    total = gaussian_filter(drawn_ratio, (sigma, sigma, 0), mode="constant", truncate=8)
     mean = total / np.maximum(weight, 1e-30)[..., None]
     near = np.exp(-np.square(distance_transform_edt(~drawn) / sigma) / 2)[..., None]
     return np.where(drawn[..., None], ratio, mean * near).astype(np.float32)

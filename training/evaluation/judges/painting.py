@@ -33,10 +33,12 @@ def disc(size: tuple[int, ...], at: Point, radius: float) -> NDArray[np.bool_]:
     return np.asarray(np.hypot(columns - at[0], rows - at[1]) <= radius)
 
 
-def base_light(own: Raster, mask: NDArray) -> float:
-    """Return the mean luminance that the Lumi map `own` has under a mask of the photo's size."""
-    drawn = OPS.reduce_strokes(np.zeros((*mask.shape, 3), np.float32), mask.astype(np.float32), own.shape[:2])
-    local = float((own @ LUMINANCE)[drawn.mask > 0].mean())
+def base_light(estimated: Raster, mask: NDArray) -> float:
+    """Return the mean luminance that the Lumi map `estimated` has under a mask of the photo's size."""
+    drawn = OPS.reduce_strokes(
+        np.zeros((*mask.shape, 3), np.float32), mask.astype(np.float32), estimated.shape[:2]
+    )
+    local = float((estimated @ LUMINANCE)[drawn.mask > 0].mean())
     return local if local > FAINTEST else DEFAULT_LIGHT
 
 

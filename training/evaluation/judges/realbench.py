@@ -122,7 +122,7 @@ def make_pair(view: Lit, kind: str, seed: list[int], name: str) -> Task | None:
     """Draw lights until copying the source scores at most MOST_COPY; None where none do."""
     rng = np.random.default_rng(seed)
     for _ in range(DRAWS):
-        lights = own_lights(rng, view)
+        lights = source_lights(rng, view)
         if lights is None:
             return None
         relights = change_lamp(rng, view, lights, kind)
@@ -134,7 +134,7 @@ def make_pair(view: Lit, kind: str, seed: list[int], name: str) -> Task | None:
     return None
 
 
-def own_lights(rng: Generator, view: Lit) -> Raster | None:
+def source_lights(rng: Generator, view: Lit) -> Raster | None:
     """Return a photo's own light, (K, 3) strength times tint; None for a view of fewer than two lamps.
 
     One lamp at least stays off, so that one can be added.

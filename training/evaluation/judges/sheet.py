@@ -75,9 +75,12 @@ def make_sheet(
             drawn = read_strokes(ideas / idea.strokes, (source.shape[0], source.shape[1]))
             if not isinstance(drawn, list):
                 raise InputError(f"{idea.strokes} is no JSON. Ideas are strokes drawn as lines.")
-            result = np.asarray(relighter.relight(source, drawn, steps=steps).picture)
+            strokes = [one for one in drawn if isinstance(one, Stroke)]
+            if len(strokes) < len(drawn):
+                raise InputError(f"{idea.strokes} blends its strokes. Ideas are strokes that set the light.")
+            result = np.asarray(relighter.relight(source, strokes, steps=steps).picture)
             write_photo(out / f"{Path(idea.strokes).stem}.png", Picture(result), {})
-            cells += [(idea.idea, marked(source, drawn)), ("", result)]
+            cells += [(idea.idea, marked(source, strokes)), ("", result)]
             done += 1
             if progress:
                 progress(done, len(listed))

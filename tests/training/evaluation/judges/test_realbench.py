@@ -15,8 +15,8 @@ from dior_rt.training.evaluation.judges.realbench import (
     Recipe,
     change_lamp,
     make_realbench,
-    own_lights,
     read_view,
+    source_lights,
 )
 from dior_rt.training.evaluation.judges.sheet import CELL, GAP, IDEAS, contact, read_ideas
 from dior_rt.training.evaluation.judges.subjects import find_photo
@@ -76,13 +76,13 @@ def test_one_lamp_changes_and_the_world_stays() -> None:
     view, rng = Lit(np.ones((5, 4, 4, 3)), np.ones((5, 4, 4, 3)), True), np.random.default_rng(0)
     for kind, on, off in (("change", 0, 0), ("add", 1, 0), ("replace", 1, 1)):
         for _ in range(20):
-            lights = own_lights(rng, view)
+            lights = source_lights(rng, view)
             changed = change_lamp(rng, view, lights, kind)
             before, after = lights.any(axis=1), changed.any(axis=1)
             assert (after & ~before).sum() == on and (before & ~after).sum() == off
             assert np.array_equal(lights[-1], changed[-1])
             assert (lights != changed).any(axis=1).sum() == max(on + off, 1)
-    assert own_lights(rng, Lit(np.ones((2, 4, 4, 3)), np.ones((2, 4, 4, 3)), True)) is None
+    assert source_lights(rng, Lit(np.ones((2, 4, 4, 3)), np.ones((2, 4, 4, 3)), True)) is None
 
 
 def test_what_is_no_view_or_belongs_to_training_is_refused(views, tmp_path) -> None:
