@@ -398,7 +398,7 @@ class OpenPhoto:
     def _reduced(self) -> tuple[Array, Array]:
         relighter = self._relighter
         source, encoded = relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
-        # The network sees nothing brighter than white; its ratio at white is applied to brighter light as well.
+        # The network sees nothing brighter than white; its ratio at white also serves brighter light.
         return np.minimum(source, np.float32(1)), encoded
 
     @cached_property

@@ -78,11 +78,11 @@ def fit_command(
     """Train on packed views, by time or by steps. A run in OUT goes on where it stopped."""
     config = FitConfig(minutes, steps, batch, rate, seed=seed, precision=precision, compiled=compiled)
     sizes = LumenConfig(width=width, heads=heads, scene_depth=depth, light_depth=depth)
-    start = time.monotonic()
+    begun = time.monotonic()
 
     def progress(step: int, done: float, errors: dict[str, float]) -> None:
         shown = " ".join(f"{name} {value:.4f}" for name, value in errors.items())
-        print(f"{step:6d} {100 * done:5.1f}% {time.monotonic() - start:6.1f} s  {shown}", flush=True)
+        print(f"{step:6d} {100 * done:5.1f}% {time.monotonic() - begun:6.1f} s  {shown}", flush=True)
 
     try:
         fit(packs, out, config, sizes, backbone, surfaces, start, progress)
