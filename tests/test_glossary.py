@@ -52,7 +52,6 @@ TENSOR_FILES = (
 #: Identifiers that still wait for a new name. The list only ever gets shorter.
 WAITING = {
     ("dior_rt/cli/__init__.py", "told"),
-    ("dior_rt/cli/about.py", "own"),
     ("dior_rt/images/exr.py", "_hushed"),
     ("dior_rt/images/exr.py", "given"),
     ("dior_rt/images/photo.py", "given"),
