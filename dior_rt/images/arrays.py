@@ -40,17 +40,35 @@ def read_pixels(photo: Picture) -> NDArray:
     return pixels
 
 
+def to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
+    """A photo's pixels for the eye: uint8, clipped at display white."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)
+    return (np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def like_photo(pixels: NDArray, photo: Picture) -> Picture:
     """The pixels as the photo's kind: a Pillow image gets the photo's alpha, and its ICC and EXIF data."""
     return image_of(photo_of(photo), pixels) if isinstance(photo, Image.Image) else pixels
 
 
+def primaries_of(photo: Picture) -> Matrix:
+    """The primaries that a Pillow image's profile names; those of sRGB for an array."""
+    return photo_of(photo).primaries if isinstance(photo, Image.Image) else srgb()
+
+
 def in_primaries_of(photo: Picture, strokes: Any) -> Any:
-    """Strokes of any kind with their light in the primaries of a photo, which a Pillow image may name.
+    """Strokes of any kind with their light in the primaries of a photo, which a Pillow image may name."""
+    return to_primaries(strokes, primaries_of(photo))
+
+
+def to_primaries(strokes: Any, target: Matrix) -> Any:
+    """Strokes of any kind with their light in the target's primaries.
 
     Arrays, Strokes and Stroke have those of sRGB; a Pillow image of strokes has its own profile's.
     """
-    target = photo_of(photo).primaries if isinstance(photo, Image.Image) else srgb()
     if isinstance(strokes, Image.Image):
         _check_8_bit(strokes)
         return convert_raster(_read_rgba(strokes), conversion(photo_of(strokes).primaries, target))
