@@ -399,7 +399,7 @@ class OpenPhoto:
         relighter = self._relighter
         source, encoded = relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
         # The network sees nothing brighter than white; its ratio at white also serves brighter light.
-        return np.minimum(source, np.float32(1)), encoded
+        return source.clip(max=1), encoded
 
     @cached_property
     def _source_map(self) -> Array:
