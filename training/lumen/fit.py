@@ -100,6 +100,7 @@ def fit(
     backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new materials.
     Raises InputError for files that cannot be used, and where training diverges.
     """
+    views = load_shards(packs)
     make_folder(out)
     torch.manual_seed(config.seed)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -115,7 +116,7 @@ def fit(
     if (out / INDEX).exists():
         resume(out, network, average, optimizer, clock)
     tiles = load_tiles(surfaces).to(device) if surfaces is not None else None
-    maker = BatchMaker(load_shards(packs).to(device), config.batch, config.seed, tiles=tiles)
+    maker = BatchMaker(views.to(device), config.batch, config.seed, tiles=tiles)
     step = make_step(network, config, device)
     running: dict[str, float] = {}
     skipped = torch.zeros((), device=device)
