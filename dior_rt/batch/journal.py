@@ -173,7 +173,7 @@ def _hold(descriptor: int) -> bool:
         import msvcrt
 
         try:
-            os.lseek(descriptor, 1 << 40, os.SEEK_SET)  # the lock lies beyond the lines, so that others may read them
+            os.lseek(descriptor, 1 << 40, os.SEEK_SET)  # beyond the lines, so that others may read them
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
         except OSError:
             return False

@@ -59,8 +59,7 @@ def relight_file(
     turn: AbstractContextManager[Any] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Outcome:
-    """Relight the photo into its result. Errors are returned in the outcome, and no file is left
-    half-written.
+    """Relight the photo into its result, which is written whole or not at all, and return errors as outcomes.
 
     turn: a lock held while the network runs, not while files are read and written.
     stopped: called after every step; whether to stop.

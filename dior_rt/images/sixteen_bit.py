@@ -28,7 +28,7 @@ Deep = NDArray[np.uint16]
 #: of bytes costs time, and space too.
 STRATEGY = zlib.Z_RLE
 
-_ROWS = 64  # rows per strip; each is compressed separately, so that a 100-megapixel picture needs no second copy
+_ROWS = 64  # rows per strip; compressed one by one, so that a large picture needs no second copy
 
 
 def is_deep(image: ImageFile.ImageFile) -> bool:

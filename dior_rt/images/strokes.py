@@ -275,7 +275,7 @@ def _read_npy(path: Path, what: str) -> NDArray[np.float32]:
             raise ValueError(f"its light must be floating-point and linear, not {array.dtype}")
         if array.shape[0] * array.shape[1] > MOST_PIXELS:
             raise ValueError(f"it has more than {MOST_PIXELS // 10**6} megapixels")
-        with np.errstate(over="ignore"):  # values too large for float32 become infinite, and infinite values are refused
+        with np.errstate(over="ignore"):  # too large values become infinite and are refused
             return np.array(array, np.float32)
     except (*DAMAGE, MemoryError, TokenError, RecursionError) as error:
         raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
