@@ -82,7 +82,7 @@ def _ora(photo: Photo, lights: Sequence[Light], pictures: Sequence[bytes]) -> by
     thumbnail.thumbnail((_THUMBNAIL, _THUMBNAIL))
     return _archive(
         {
-            "mimetype": b"image/openraster",  # first and stored, so that its bytes are readable without unzipping
+            "mimetype": b"image/openraster",  # first and stored, to be readable without unzipping
             "stack.xml": xml.encode(),
             "data/photo.png": _png(pixels),
             **dict(zip(names, pictures, strict=True)),
