@@ -28,13 +28,13 @@ from dior_rt.training.lumen.pack import load_shards
 SIZES: Final = LumenConfig()
 WARM_UP: Final = 0.04
 DECAY: Final = 0.35
-BACKBONE_RATE: Final = 0.25  # of the rate: pretrained weights move less
+BACKBONE_RATE: Final = 0.25  # factor on the learning rate: pretrained weights move less
 AVERAGED: Final = 0.06  # the time constant of the weights' average, as a share of the run
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to train.
+    """The options of training.
 
     minutes: of training, loading and compiling included; None: `steps` decide.
     steps: of the optimiser, where minutes is None.
@@ -60,7 +60,9 @@ class FitConfig:
 
 @dataclass
 class Clock:
-    """How much of a run is done, 0..1, by time or by steps. A resumed run goes on where it stopped."""
+    """The share of a run that is done, 0..1, by time or by steps. A resumed run continues where it
+    stopped.
+    """
 
     config: FitConfig
     step: int = 0
@@ -76,7 +78,7 @@ class Clock:
 
     @property
     def rate(self) -> float:
-        """Warm up, stay, fall to 0."""
+        """Return the learning rate: it warms up, stays, and falls to 0."""
         warm = min(1.0, (self.step + 1) / 100, self.done / WARM_UP + 0.01)
         return warm * min(1.0, max(0.0, (1 - self.done) / DECAY))
 
@@ -94,11 +96,12 @@ def fit(
     start: Path | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Train on the shards in `packs`; the folder `out` receives the state in parts and resumes from it.
+    """Train on the shards in `packs`. The folder `out` receives the state in parts, and training resumes from
+    it.
 
-    sizes: of a new network. start: the checkpoint of another run to go on from instead, with a new schedule.
-    backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new materials.
-    Raises InputError for files that cannot be used, and where training diverges.
+    sizes: of a new network. start: the checkpoint of another run to continue from instead, with a new
+    schedule. backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new
+    materials. Raises InputError for files that cannot be used, and where training diverges.
     """
     make_folder(out)
     torch.manual_seed(config.seed)
@@ -166,7 +169,7 @@ def fit(
 
 
 def seconds_since_start() -> float:
-    """How long this process has run, as far as the system tells."""
+    """Return how long this process has run, as far as the system reports it."""
     try:
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         uptime = float(Path("/proc/uptime").read_text().split()[0])
@@ -191,7 +194,7 @@ def clip(weights: list[nn.Parameter], largest: float) -> Tensor:
 
 
 def clock_share(clock: Clock, first: int) -> float:
-    """By how much the average moves towards the weights in one step."""
+    """Return the factor by which the average moves towards the weights in one step."""
     if clock.config.minutes is None:
         return 1 / (AVERAGED * clock.config.steps)
     steps = clock.step - first + 1
@@ -200,7 +203,7 @@ def clock_share(clock: Clock, first: int) -> float:
 
 
 def make_optimizer(network: Lumen, config: FitConfig) -> torch.optim.Optimizer:
-    """AdamW; matrices decay, biases and scales do not, and the backbone moves less."""
+    """Return AdamW. Matrices decay, biases and scales do not, and the backbone's rate is smaller."""
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
     for name, weight in network.named_parameters():
         share = BACKBONE_RATE if name.startswith("scene.backbone") else 1.0
@@ -214,7 +217,7 @@ def make_optimizer(network: Lumen, config: FitConfig) -> torch.optim.Optimizer:
 
 
 def states(batch: Batch, config: FitConfig, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Flow times (B,) and states of x0: mostly pure noise, which is the first step of sampling."""
+    """Return flow times (B,) and states of x0: mostly pure noise, as in the first step of sampling."""
     count, device = len(batch.photo), batch.photo.device
     u = torch.rand(count, generator=generator, device=device)
     sigma = config.shift * u / (1 + (config.shift - 1) * u)
@@ -229,7 +232,7 @@ Step = Callable[[Batch, Tensor, Tensor], dict[str, Tensor]]
 
 
 def make_step(network: Lumen, config: FitConfig, device: torch.device) -> Step:
-    """A function that computes the gradients of one batch and returns its errors."""
+    """Return a function that computes the gradients of one batch and returns its errors."""
     half = config.precision == "bf16" or (config.precision == "auto" and has_bf16(device))
 
     def errors_of(batch: Batch, x: Tensor, sigma: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
@@ -249,7 +252,7 @@ def make_step(network: Lumen, config: FitConfig, device: torch.device) -> Step:
 
 
 def has_bf16(device: torch.device) -> bool:
-    """Whether matrix products in bf16 are faster there than in fp32."""
+    """Return whether matrix products in bf16 are faster there than in fp32."""
     if device.type == "cuda":
         return True
     try:
@@ -288,7 +291,7 @@ def store(
 def resume(
     out: Path, network: Lumen, average: list[Tensor], optimizer: torch.optim.Optimizer, clock: Clock
 ) -> None:
-    """Take up what `store` wrote, on any device. Without the state's files, start from the average."""
+    """Load what `store` wrote, on any device. Without the state's files, start from the average."""
     try:
         head = json.loads((out / INDEX).read_text())
         means, state = read_parts(out, AVERAGE), read_parts(out, STATE)

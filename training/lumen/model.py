@@ -25,14 +25,14 @@ class Lumen(nn.Module):
     def forward(
         self, x: Tensor, sigma: Tensor, photo: Tensor, strokes: Strokes
     ) -> tuple[Scene, Completed, Tensor]:
-        """The scene, the completed light, and the relit picture, linear and not clipped."""
+        """Return the scene, the completed light, and the relit picture, linear and not clipped."""
         scene = self.scene(photo)
         return scene, *self.answer(x, sigma, photo, scene, strokes)
 
     def answer(
         self, x: Tensor, sigma: Tensor, photo: Tensor, scene: Scene, strokes: Strokes
     ) -> tuple[Completed, Tensor]:
-        """The completed light and the relit picture of a scene that is known."""
+        """Return the completed light and the relit picture of a scene from an earlier call."""
         completed = self.light(x, sigma, photo, scene, strokes)
         ratio = log_ratio(
             scene.light, completed.target / torch.exp(completed.factor), scene.bounce, completed.factor
