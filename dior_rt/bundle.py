@@ -114,8 +114,9 @@ class Bundle:
         return _sha256(self.folder / MANIFEST)
 
     def path(self, graph: str) -> Path:
-        """Return the path of the ONNX file of a graph, by the graph's name. Raises BundleError where there is
-        none.
+        """Return the path of the ONNX file of a graph, by the graph's name.
+
+        Raises BundleError where there is none.
         """
         if graph not in self.manifest.graphs:
             raise BundleError(f"The bundle {self.folder} has no graph {graph!r}; export it again.")

@@ -14,8 +14,9 @@ from dior_rt.providers import PROVIDERS, available, is_built_in
 
 @dataclass(frozen=True)
 class Device:
-    """A device. name: as --device or --ops takes it. problem: why it cannot be used, or None where it
-    passed.
+    """A device.
+
+    name: as --device or --ops takes it. problem: why it cannot be used, or None where it passed.
     """
 
     name: str

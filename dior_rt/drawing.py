@@ -136,8 +136,9 @@ class _Layer:
 
 
 class Painter:
-    """A cache of the rasters of layers. Only new shapes are drawn: the last shape grows while the pen
-    moves.
+    """A cache of the rasters of layers.
+
+    Only new shapes are drawn: the last shape grows while the pen moves.
     """
 
     def __init__(self, photo: tuple[int, int], kept: int = 32) -> None:
@@ -145,8 +146,9 @@ class Painter:
         self._layers: dict[str, _Layer] = {}
 
     def draw(self, name: str, shapes: Sequence[Shape]) -> Strokes:
-        """Return the raster of a layer by its name. It is the same object as long as the shapes are the
-        same.
+        """Return the raster of a layer by its name.
+
+        It is the same object as long as the shapes are the same.
         """
         shapes = tuple(shapes)
         layer = self._layers.pop(name, None)

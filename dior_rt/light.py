@@ -88,8 +88,9 @@ def unpack_patches(tokens: Array, size: tuple[int, int], patch: int) -> Array:
 
 
 def decode_small(encoded: Array) -> Array:
-    """Return a small sRGB picture in linear light. It is computed on the host, because a device would compile
-    for it.
+    """Return a small sRGB picture in linear light.
+
+    It is computed on the host, because a device would compile for it.
     """
     return srgb_to_linear(encoded).astype(np.float32)
 

@@ -64,8 +64,9 @@ class Light:
 
 @dataclass(frozen=True)
 class Cover:
-    """A layer on the light grid. amount: each cell's mean of m D, (h, w, 3); coverage: the mean of m, (h,
-    w).
+    """A layer on the light grid.
+
+    amount: each cell's mean of m D, (h, w, 3); coverage: the mean of m, (h, w).
     """
 
     amount: Array

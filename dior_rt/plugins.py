@@ -17,8 +17,9 @@ _lock = threading.Lock()
 
 
 def plugin_devices(name: str, choice: str = "") -> list[Any]:
-    """Return ONNX Runtime's devices of a plug-in. choice: "CPU", "GPU" or "NPU", or the number of one of
-    them.
+    """Return ONNX Runtime's devices of a plug-in.
+
+    choice: "CPU", "GPU" or "NPU", or the number of one of them.
 
     The result is empty where the package is not installed, does not fit this ONNX Runtime, or finds no such
     hardware.

@@ -35,8 +35,9 @@ FARTHEST: Final = 1e6  # pixels
 
 @dataclass(frozen=True)
 class PhotoRef:
-    """The photo that was drawn on. size: [width, height]. sha256: the hash of its file, or empty where
-    unknown.
+    """The photo that was drawn on.
+
+    size: [width, height]. sha256: the hash of its file, or empty where unknown.
     """
 
     size: tuple[int, ...]

@@ -14,8 +14,9 @@ T = TypeVar("T")
 
 
 def read_json(path: Path, most_bytes: int) -> Any:
-    """Return the JSON document at `path`. Raises ValueError for one that is too long, too deep, or not
-    standard JSON.
+    """Return the JSON document at `path`.
+
+    Raises ValueError for one that is too long, too deep, or not standard JSON.
 
     Keys that occur twice and the numbers NaN and Infinity are refused, because two readers could disagree
     about them. Raises OSError where the file cannot be read.

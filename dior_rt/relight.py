@@ -128,8 +128,9 @@ class Relighter:
 
     @property
     def ops(self) -> str:
-        """Return what runs the pixel kernels. Under "auto" NumPy replaces a device that computes wrong
-        results.
+        """Return what runs the pixel kernels.
+
+        Under "auto" NumPy replaces a device that computes wrong results.
         """
         return self._ops.name
 
@@ -148,8 +149,9 @@ class Relighter:
         return REFERENCE, *read_presets(self.bundle)
 
     def facts(self) -> dict[str, Any]:
-        """Return what determines its results, for their metadata. The manifest's hash covers those of all
-        files.
+        """Return what determines its results, for their metadata.
+
+        The manifest's hash covers those of all files.
         """
         return {
             "version": __version__,
@@ -458,8 +460,9 @@ class OpenPhoto:
         return compose(self._source_map, lights, covers)
 
     def _cover(self, drawn: Strokes | tuple[Stroke, ...]) -> Cover:
-        """Return the layer on the light grid. It is cached, because most layers stay unchanged while one is
-        drawn.
+        """Return the layer on the light grid.
+
+        It is cached, because most layers stay unchanged while one is drawn.
         """
         with self._lock:
             for source, layer in self._covers:

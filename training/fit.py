@@ -127,8 +127,9 @@ def flow_loss(
     drawn: float = 0.0,
     edges: float = 0.0,
 ) -> Tensor:
-    """Return the mean squared error of x0 at flow times sigma (B,). The network sees (1 - sigma) x0 + sigma
-    noise.
+    """Return the mean squared error of x0 at flow times sigma (B,).
+
+    The network sees (1 - sigma) x0 + sigma noise.
 
     A batch may carry `weight` (B,), the weight of each sample's error, and `own`, the light on the photo in
     the form of estimation's x0. The error of the network's estimate of it counts `source_weight` times as

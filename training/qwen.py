@@ -78,8 +78,9 @@ class Qwen(nn.Module):
         return torch.stack([self._one(*sample) for sample in samples])
 
     def _one(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mode: int) -> Tensor:
-        """Return the velocity of one sample. The modes differ in the length of their prompts and the number
-        of references.
+        """Return the velocity of one sample.
+
+        The modes differ in the length of their prompts and the number of references.
         """
         pictures = [x, photo, light] if mode == MODES["relight"] else [x, photo]
         rows, columns = x.shape[1:]

@@ -127,8 +127,9 @@ def _window(rng: Generator, size: tuple[int, ...], grid: tuple[int, int]) -> tup
 
 
 class MixedBatches(IterableDataset[Batch]):
-    """Batches of which one half is real pairs and the other half rendered triplets. The n-th is always the
-    same.
+    """Batches of which one half is real pairs and the other half rendered triplets.
+
+    The n-th is always the same.
 
     `real` (B,) marks the real samples, `weight` (B,) is the weight of each error, and `seed` draws the
     strokes.
@@ -142,8 +143,9 @@ class MixedBatches(IterableDataset[Batch]):
         start: int,
         weight: float,
     ) -> None:
-        """Store the options. triplets: a stream whose first batch has the number `start`. weight: of the
-        rendered half.
+        """Store the options.
+
+        triplets: a stream whose first batch has the number `start`. weight: of the rendered half.
         """
         super().__init__()
         self.scenes, self.triplets = scenes, triplets

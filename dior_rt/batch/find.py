@@ -48,8 +48,9 @@ def find_photos(inputs: Iterable[str], besides: Sequence[Path] = ()) -> list[Fou
 
 
 def read_names(data: bytes) -> list[str]:
-    """Return the names in a list: one per line, or separated by NUL as by `find -print0`. Raises
-    InputError.
+    """Return the names in a list: one per line, or separated by NUL as by `find -print0`.
+
+    Raises InputError.
     """
     separator = b"\0" if b"\0" in data else b"\n"
     try:

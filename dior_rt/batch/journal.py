@@ -46,8 +46,9 @@ class Print:
             return cls(stat.st_size, stat.st_mtime_ns, hashlib.file_digest(file, "sha256").hexdigest())
 
     def fits(self, path: Path) -> bool:
-        """Return whether the file still has this content. The file is read only where its time has
-        changed.
+        """Return whether the file still has this content.
+
+        The file is read only where its time has changed.
         """
         try:
             stat = path.stat()

@@ -31,8 +31,9 @@ class LocalEngine:
     def run(
         self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]
     ) -> Generator[Outcome, None, None]:
-        """Yield the outcomes as they come. `begin` is called with each result's name before it may be
-        written.
+        """Yield the outcomes as they come.
+
+        `begin` is called with each result's name before it may be written.
         """
         weights = sum((self.bundle.folder / file).stat().st_size for file in self.bundle.manifest.files)
         at_once = self.at_once or (usable_cores() if weights < SMALL_MODEL else 1)

@@ -20,8 +20,9 @@ from dior_rt.images.readers import default_form
 
 @dataclass(frozen=True)
 class Job:
-    """One photo to relight. name: the result's path below the folder of results, which is the journal's
-    key.
+    """One photo to relight.
+
+    name: the result's path below the folder of results, which is the journal's key.
     """
 
     photo: Path
@@ -41,8 +42,9 @@ class Refused:
 
 @dataclass(frozen=True)
 class Plan:
-    """The plan of a batch. jobs: the work to do. done: photos whose results exist. refused: photos that
-    cannot be relit.
+    """The plan of a batch.
+
+    jobs: the work to do. done: photos whose results exist. refused: photos that cannot be relit.
     """
 
     jobs: tuple[Job, ...]

@@ -39,8 +39,9 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a job. error: None where its result is written. The prints are those of the files as
-    used.
+    """The outcome of a job.
+
+    error: None where its result is written. The prints are those of the files as used.
     """
 
     job: Job

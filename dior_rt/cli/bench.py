@@ -161,7 +161,7 @@ def _pairs(files: list[Path], stack: ExitStack, megapixels: float) -> list[Pair]
 
 @contextmanager
 def _progress(runs: int) -> Iterator[Callable[[str], None]]:
-    """Return a callback that moves a bar on a terminal, and does nothing elsewhere."""
+    """Yield a callback that moves a bar on a terminal, and does nothing elsewhere."""
     if not sys.stderr.isatty():
         yield lambda name: None
         return

@@ -38,8 +38,9 @@ COMMANDS: Final = ("relight", "batch", "estimate", "devices", "bench")
 
 @dataclass(frozen=True)
 class Default:
-    """One default. command: the command it applies to, or None for all that have the option. source: its
-    place.
+    """One default.
+
+    command: the command it applies to, or None for all that have the option. source: its place.
     """
 
     setting: str
@@ -61,8 +62,9 @@ def config_path(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def read_defaults(environment: Mapping[str, str] = os.environ) -> list[Default]:
-    """Return the defaults in order, so that later ones override earlier ones. Raises InputError for an
-    invalid file.
+    """Return the defaults in order, so that later ones override earlier ones.
+
+    Raises InputError for an invalid file.
     """
     found = _read_file(config_path(environment), must=CONFIG in environment)
     for setting in SETTINGS:

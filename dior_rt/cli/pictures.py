@@ -312,7 +312,7 @@ def _with_format(out: Path, form: str | None) -> Path:
 
 @contextmanager
 def _progress(label: str, quiet: bool = False) -> Iterator[Callable[[int, int], None]]:
-    """Return a callback that moves a bar on a terminal, and does nothing elsewhere."""
+    """Yield a callback that moves a bar on a terminal, and does nothing elsewhere."""
     if quiet or not sys.stderr.isatty():
         yield lambda step, steps: None
         return

@@ -80,8 +80,9 @@ def _spool(folder: Path) -> Path:
 
 
 def suffix_of(head: bytes) -> str:
-    """Return the suffix that fits a file's first bytes. All pictures get ".png" and are distinguished
-    later.
+    """Return the suffix that fits a file's first bytes.
+
+    All pictures get ".png" and are distinguished later.
     """
     signatures = {b"\x76\x2f\x31\x01": ".exr", b"\x93NUMPY": ".npy", b"PK\x03\x04": ".dior"}
     for signature, suffix in signatures.items():

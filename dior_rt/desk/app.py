@@ -172,7 +172,7 @@ def _add_jobs(app: FastAPI, studio: Studio) -> None:
 
     @app.get("/api/jobs/{job}/events")
     def events(job: str) -> StreamingResponse:
-        """Return the job's states as server-sent events, until it is over."""
+        """Stream the job's states as server-sent events, until it is over."""
         states = _job(studio, job).states()
 
         def stream() -> Iterator[str]:
@@ -279,8 +279,9 @@ async def _body(request: Request, most: int) -> bytes:
 
 
 async def _limited(request: Request, most: int) -> AsyncIterator[bytes]:
-    """Yield the body's parts. Raises 413 as soon as the body is, or declares that it will be, longer than
-    `most` bytes.
+    """Yield the body's parts.
+
+    Raises 413 as soon as the body is, or declares that it will be, longer than `most` bytes.
     """
     announced = request.headers.get("content-length", "0")
     seen = int(announced) if announced.isdigit() else 0

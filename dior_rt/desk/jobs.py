@@ -19,8 +19,9 @@ FINAL: Final = ("done", "failed", "cancelled")
 
 @dataclass(frozen=True)
 class State:
-    """The state of a job. ahead: jobs before it; step, steps: those of the sampler; message: what went
-    wrong.
+    """The state of a job.
+
+    ahead: jobs before it; step, steps: those of the sampler; message: what went wrong.
     """
 
     stage: Stage
@@ -97,8 +98,9 @@ class Queue:
     """Jobs in the order of arrival, one of which runs at a time. The last results are kept."""
 
     def __init__(self, kept: int = 4, waiting: int = 8) -> None:
-        """Start the queue. kept: the number of finished jobs with results; waiting: the number of jobs that
-        may wait.
+        """Start the queue.
+
+        kept: the number of finished jobs with results; waiting: the number of jobs that may wait.
         """
         self._kept, self._most_waiting = kept, waiting
         self._jobs: OrderedDict[str, Job] = OrderedDict()

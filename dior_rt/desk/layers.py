@@ -36,8 +36,9 @@ _THUMBNAIL: Final = 256  # pixels per side, by the OpenRaster specification
 
 
 def write_layers(photo: Photo, lights: Sequence[Light], kind: str, folder: Path) -> bytes:
-    """Write the lights in one file of a LAYER_FORMATS kind, the first at the bottom. Raises InputError for no
-    lights.
+    """Write the lights in one file of a LAYER_FORMATS kind, the first at the bottom.
+
+    Raises InputError for no lights.
     """
     if not lights:
         raise InputError("There is no light to export.")

@@ -72,8 +72,9 @@ class Studio:
     """The model, which loads while the page opens; the photos; and the queue of full results."""
 
     def __init__(self, load: Callable[[], Relighter], folder: Path) -> None:
-        """Start to load the model. load: makes it. folder: for files that are deleted when the desk
-        closes.
+        """Start to load the model.
+
+        load: makes it. folder: for files that are deleted when the desk closes.
         """
         self.folder = folder
         self.queue = Queue()

@@ -23,7 +23,8 @@ _MAGIC = (
 
 
 def is_raw(head: bytes) -> bool:
-    """Return whether a file that begins like this is a camera's raw file. DNG and NEF are recognised by their
-    tags.
+    """Return whether a file that begins like this is a camera's raw file.
+
+    DNG and NEF are recognised by their tags.
     """
     return any(head[at : at + len(magic)] == magic for at, magic in _MAGIC)

@@ -21,8 +21,9 @@ from dior_rt.images.primaries import Matrix, srgb, to_xyz
 
 @dataclass(frozen=True)
 class ExrPicture:
-    """A picture from an EXR file. pixels: (H, W, 3 or 4) float32. primaries: those of its RGB, as
-    `primaries.to_xyz`.
+    """A picture from an EXR file.
+
+    pixels: (H, W, 3 or 4) float32. primaries: those of its RGB, as `primaries.to_xyz`.
     """
 
     pixels: NDArray[np.float32]

@@ -37,8 +37,9 @@ class Curves:
 
     @property
     def is_srgb(self) -> bool:
-        """Return whether the curves equal sRGB's to half a step of 8 bits. The numbers are then left
-        alone.
+        """Return whether the curves equal sRGB's to half a step of 8 bits.
+
+        The numbers are then left alone.
         """
         codes = np.linspace(0, 1, self.srgb.shape[1])
         return bool(np.abs(self.srgb - codes).max() <= 0.5 / 255)
@@ -200,8 +201,9 @@ def _curve(tag: bytes, x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _parametric(kind: int, p: list[float], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return Y = (a X + b)^g + e for X >= d, and c X + f below. Table 68 of ICC.1:2022 lists which are
-    present.
+    """Return Y = (a X + b)^g + e for X >= d, and c X + f below.
+
+    Table 68 of ICC.1:2022 lists which are present.
     """
     g = p[0]
     a, b = (p[1], p[2]) if kind > 0 else (1.0, 0.0)

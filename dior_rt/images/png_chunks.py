@@ -18,8 +18,9 @@ _RAW = b"Raw profile type "
 
 
 def read_chunks(file: IO[bytes]) -> dict[bytes, bytes]:
-    """Return the needed chunks by name. Metadata from text chunks is stored under b"xmp", b"exif" and
-    b"iptc".
+    """Return the needed chunks by name.
+
+    Metadata from text chunks is stored under b"xmp", b"exif" and b"iptc".
 
     Damaged chunks are left out.
     """

@@ -43,8 +43,9 @@ _SAME = 2e-3  # of two matrices: what ICC's fixed-point numbers and other whites
 
 
 def to_xyz(xy: Chromaticities) -> Matrix:
-    """Return (3, 3), linear RGB -> XYZ under D50, by the Bradford transform. Raises ValueError for no real
-    space.
+    """Return (3, 3), linear RGB -> XYZ under D50, by the Bradford transform.
+
+    Raises ValueError for no real space.
     """
     x, y = np.array(xy[::2], np.float64), np.array(xy[1::2], np.float64)
     if not (np.isfinite([x, y]).all() and (np.abs([x, y]) < 10).all() and (y[3] > 1e-3) and abs(y).min() > 0):
@@ -80,8 +81,9 @@ def conversion(source: Matrix, target: Matrix) -> Matrix | None:
 
 
 def convert(light: NDArray[Any], matrix: Matrix | None) -> NDArray[Any]:
-    """Convert (..., 3) light by a `conversion`. Colours outside the target's gamut are clipped to its border,
-    at 0.
+    """Convert (..., 3) light by a `conversion`.
+
+    Colours outside the target's gamut are clipped to its border, at 0.
     """
     if matrix is None:
         return light

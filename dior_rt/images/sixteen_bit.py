@@ -61,7 +61,7 @@ def read_deep(open_image: Callable[[], ImageFile.ImageFile]) -> Deep:
 
 
 def write_png(file: IO[bytes], samples: Deep, info: PngImagePlugin.PngInfo) -> None:
-    """Return a PNG of (H, W, 3 or 4) uint16 samples, with info's chunks ahead of the pixels."""
+    """Write a PNG of (H, W, 3 or 4) uint16 samples, with info's chunks ahead of the pixels."""
     height, width, channels = samples.shape
     file.write(b"\x89PNG\r\n\x1a\n")
     header = struct.pack(">2I5B", width, height, 16, {3: 2, 4: 6}[channels], 0, 0, 0)
@@ -82,7 +82,7 @@ def write_png(file: IO[bytes], samples: Deep, info: PngImagePlugin.PngInfo) -> N
 def write_tiff(
     file: IO[bytes], samples: Pixels, tags: Directory, children: Mapping[int, Mapping[int, Entry]]
 ) -> None:
-    """Return a TIFF of (H, W, 3 or 4) uint8 or uint16 samples, deflated as differences, with further tags.
+    """Write a TIFF of (H, W, 3 or 4) uint8 or uint16 samples, deflated as differences, with further tags.
 
     children: directories by the tag that points at them.
     """

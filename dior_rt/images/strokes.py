@@ -55,8 +55,9 @@ _MOST_JSON_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class DrawingFile:
-    """The content of a drawing. strokes: as `Relighter.relight` takes them. notices: sentences about missing
-    data.
+    """The content of a drawing.
+
+    strokes: as `Relighter.relight` takes them. notices: sentences about missing data.
     """
 
     strokes: NDArray | list[Stroke] | list[Light]
@@ -164,8 +165,9 @@ def write_strokes(path: Path, strokes: Strokes, settings: Mapping[str, Any]) -> 
 
 @dataclass(frozen=True)
 class Raster:
-    """A raster of light. pixels: (H, W, 4) light and mask, see `read_drawing`. primaries: those of the
-    light.
+    """A raster of light.
+
+    pixels: (H, W, 4) light and mask, see `read_drawing`. primaries: those of the light.
     """
 
     pixels: NDArray

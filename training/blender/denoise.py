@@ -9,8 +9,9 @@ Raster = NDArray[np.float32]
 
 
 def denoised(noisy: Raster, albedo: Raster, normals: Raster) -> Raster:
-    """Return the raster (H, W, 3), linear and >= 0, without its noise. The guides are (H, W, 3), free of
-    noise.
+    """Return the raster (H, W, 3), linear and >= 0, without its noise.
+
+    The guides are (H, W, 3), free of noise.
     """
     import mitsuba_oidn
 

@@ -58,7 +58,7 @@ class Catalogue:
         return self._archive.read(self._names[name.lower()])
 
     def items(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """Return the catalogue's models: number and properties."""
+        """Yield the catalogue's models: number and properties."""
         text = self.read(CATALOGUE).decode("latin1")
         found: dict[int, dict[str, str]] = {}
         for key, number, value in re.findall(r"^(\w+)#(\d+)=(.*)$", text, re.M):
@@ -87,8 +87,9 @@ class Model:
 
 
 def models(catalogue: Catalogue) -> Iterator[Model]:
-    """Return the catalogue's models that scenes can use. Models that are too large or not readable are left
-    out.
+    """Yield the catalogue's models that scenes can use.
+
+    Models that are too large or not readable are left out.
     """
     for number, properties in catalogue.items():
         described = _entry(catalogue, number, properties)

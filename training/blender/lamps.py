@@ -1,5 +1,6 @@
-"""Lamps for a view: seven besides the panorama, three of them near surfaces. Each lights a visible
-surface.
+"""Lamps for a view: seven besides the panorama, three of them near surfaces.
+
+Each lights a visible surface.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ GOBO_SHARE = 0.3
 
 
 def lamps(scene: BlenderScene, camera: Camera, stage: Stage, hits: Hits, rng: Generator) -> list[Lamp]:
-    """Choose the view's lamps. There are fewer than LAMPS where no more reach enough of the visible
-    surfaces.
+    """Choose the view's lamps.
+
+    There are fewer than LAMPS where no more reach enough of the visible surfaces.
     """
     near: list[Callable[..., Lamp | None]] = [candle, rim, torch]
     far: list[Callable[..., Lamp | None]] = [key, key, window_light, spot, spot, sun, sun, top]

@@ -62,7 +62,7 @@ def _subject(stock: Stock, things: list[Thing], ground: Floor) -> Thing:
 
 
 def _houses(stock: Stock, things: list[Thing]) -> None:
-    """Return plain houses with windows of dark gloss, some metres behind."""
+    """Add plain houses with windows of dark gloss, some metres behind."""
     rng = stock.rng
     for _ in range(int(rng.integers(1, 4))):
         w, d, h = rng.uniform(3, 9), rng.uniform(2, 6), rng.uniform(2.5, 9)
@@ -77,7 +77,7 @@ def _houses(stock: Stock, things: list[Thing]) -> None:
 
 
 def _fence(stock: Stock, things: list[Thing], subject: Thing) -> None:
-    """Return a row of thin posts with two rails, behind or beside the subject."""
+    """Add a row of thin posts with two rails, behind or beside the subject."""
     rng = stock.rng
     finish = metal(rng) if rng.random() < 0.4 else paint(rng)
     step, tall, wide = rng.uniform(0.12, 0.5), rng.uniform(0.6, 1.6), rng.uniform(0.015, 0.08)

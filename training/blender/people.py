@@ -156,8 +156,9 @@ def _read_obj(text: str) -> tuple[Array, Array, dict[str, tuple[Faces, Faces]]]:
 
 
 def _weights(folder: Path, count: int) -> Array:
-    """Return (vertices, bones). The weight of each bone of the rig goes to the nearest bone of BONES above
-    it.
+    """Return (vertices, bones).
+
+    The weight of each bone of the rig goes to the nearest bone of BONES above it.
     """
     rig = json.loads((folder / "rigs/standard/rig.default_no_toes.json").read_text())
     weighted = json.loads((folder / "rigs/standard/weights.default.json").read_text())["weights"]

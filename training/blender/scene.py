@@ -138,8 +138,9 @@ class Panorama:
 
 @dataclass(frozen=True, eq=False)
 class BlenderScene:
-    """Objects under a panorama. cameras: candidates, best first. span: size of the important part, in
-    metres.
+    """Objects under a panorama.
+
+    cameras: candidates, best first. span: size of the important part, in metres.
     """
 
     kind: str

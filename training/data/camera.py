@@ -118,8 +118,9 @@ def white_balance(rng: Generator) -> Raster:
 
 
 def softened(raster: Raster, deviation: float) -> Raster:
-    """Return (H, W, C) blurred in both directions by three taps of that standard deviation in cells. Edges
-    are extended.
+    """Return (H, W, C) blurred in both directions by three taps of that standard deviation in cells.
+
+    Edges are extended.
     """
     side = np.float32(deviation**2 / 2)
     for axis in (0, 1):

@@ -12,8 +12,9 @@ Raster = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Guides:
-    """The guides of one camera's view, free of noise. albedo: (H, W, 3) in 0..1. normal: (H, W, 3), unit
-    vectors.
+    """The guides of one camera's view, free of noise.
+
+    albedo: (H, W, 3) in 0..1. normal: (H, W, 3), unit vectors.
     """
 
     albedo: Raster

@@ -56,7 +56,7 @@ def take_photos(
 
 
 def photos_of(view: View, rng: Generator, count: int = PHOTOS) -> Iterator[NDArray[np.uint8]]:
-    """Return a view under random lights, each time taken by one camera of random style: (H, W, 3) 8-bit
+    """Yield a view under random lights, each time taken by one camera of random style: (H, W, 3) 8-bit
     sRGB.
     """
     camera, balance = random_camera(rng), white_balance(rng)

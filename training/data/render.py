@@ -163,8 +163,9 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene's objects as they are, and all white and matte. Loaded once, as loading costs as much as a
-    render.
+    """A scene's objects as they are, and all white and matte.
+
+    Loaded once, as loading costs as much as a render.
     """
 
     original: Shapes
@@ -228,8 +229,9 @@ def surfaces(stage: Stage, camera: Camera, resolution: int) -> Guides:
 
 
 def rays_for(source: Source, samples: int) -> int:
-    """Return the rays per pixel for a source. Most rays of a source that shines from everywhere are
-    blocked.
+    """Return the rays per pixel for a source.
+
+    Most rays of a source that shines from everywhere are blocked.
     """
     return 2 * samples if source.kind in AROUND else samples
 

@@ -97,8 +97,9 @@ def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
 
 
 def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lights:
-    """Return the lights with one added, removed, dimmed, strengthened or tinted anew. The last one is never
-    removed.
+    """Return the lights with one added, removed, dimmed, strengthened or tinted anew.
+
+    The last one is never removed.
     """
     changed = lights.copy()
     k = rng.choice(np.flatnonzero(usable))

@@ -1,9 +1,10 @@
-"""A batched camera: what carries linear renders towards real photos. The twin of the picture style in
-`camera.Camera`.
+"""A batched camera, which makes linear renders resemble real photos.
+
+It has the same picture style as `camera.Camera`.
 
     linear light -> blur -> noise -> picture style -> sharpening -> 8 bits
 
-The style shapes photo and relit picture alike; everything else befalls the photo alone.
+The style applies to photo and relit picture alike. All other stages apply only to the photo.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ PART: Final = 15_000_000  # bytes per file
 
 
 def save_lumen(network: Lumen, path: Path, half: bool = False) -> None:
-    """Write weights as safetensors, with the configuration in the header, whole or not at all. Raises
-    InputError.
+    """Write weights as safetensors, with the configuration in the header, whole or not at all.
+
+    Raises InputError.
     """
     weights = {
         name: (weight.detach().cpu().half() if half else weight.detach().cpu()).contiguous()

@@ -60,8 +60,9 @@ class FitConfig:
 
 @dataclass
 class Clock:
-    """The share of a run that is done, 0..1, by time or by steps. A resumed run continues where it
-    stopped.
+    """The share of a run that is done, 0..1, by time or by steps.
+
+    A resumed run continues where it stopped.
     """
 
     config: FitConfig
@@ -96,8 +97,9 @@ def fit(
     start: Path | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Train on the shards in `packs`. The folder `out` receives the state in parts, and training resumes from
-    it.
+    """Train on the shards in `packs`.
+
+    The folder `out` receives the state in parts, and training resumes from it.
 
     sizes: of a new network. start: the checkpoint of another run to continue from instead, with a new
     schedule. backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new

@@ -1,4 +1,4 @@
-"""Lumen: the scene network and the light network, and the picture that follows."""
+"""Lumen: the scene network, the light network, and the picture that results."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from dior_rt.training.lumen.shading import log_ratio, relight
 
 
 class Lumen(nn.Module):
-    """photo -> scene (once a photo); scene and strokes -> completed light (every step of the flow) ->
-    picture.
+    """The whole network.
+
+    photo -> scene (once per photo)
+    scene and strokes -> completed light (every step of the flow) -> picture
     """
 
     def __init__(self, config: LumenConfig) -> None:

@@ -20,8 +20,9 @@ def srgb_to_linear(encoded: Tensor) -> Tensor:
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
-    """Return encoded values (IEC 61966-2-1) of light in 0..1. The straight part near black continues below
-    0.
+    """Return encoded values (IEC 61966-2-1) of light in 0..1.
+
+    The straight part near black continues below 0.
     """
     curve = 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
@@ -73,8 +74,9 @@ def spread(values: Tensor, mask: Tensor, deviation: float, least: float = 1e-3) 
 
 
 def double(cells: Tensor) -> Tensor:
-    """Resample bilinearly to twice the sides. It uses slices, so its gradient needs no scattered
-    additions.
+    """Resample bilinearly to twice the sides.
+
+    It uses slices, so its gradient needs no scattered additions.
     """
     for dim in (2, 3):
         first, last = cells.narrow(dim, 0, 1), cells.narrow(dim, cells.shape[dim] - 1, 1)

@@ -1,8 +1,8 @@
-"""Renders to shards that fit through a narrow door: one zip of pictures for many views, some 25 KB a view.
+"""Pack renders into small shards: one zip of pictures for many views, about 25 KB per view.
 
-A view is two AVIF sheets (colour: the picture under every source, the environment's Lumi map, normals and
-albedo;
-grey: the lamps' Lumi maps and depth), a lossless PNG of object numbers, and a JSON head.
+A view is two AVIF sheets, a lossless PNG of object numbers, and a JSON head. The colour sheet holds the
+picture under every source, the environment's Lumi map, normals and albedo. The grey sheet holds the lamps'
+Lumi maps and depth.
 """
 
 from __future__ import annotations
@@ -141,8 +141,9 @@ def write_shards(
     most: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Path]:
-    """Write `shard-000.zip` and so on, each of at most `largest` bytes. `most`: the maximum number of
-    shards.
+    """Write `shard-000.zip` and so on, each of at most `largest` bytes.
+
+    `most`: the maximum number of shards.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths: list[Path] = []

@@ -2,10 +2,9 @@
 
     relit = (photo + e) * exp(r) - e      r = log((T + B(T) + b) / (S + B(S) + b)) + factor
 
-S and T are the source and target Lumi maps, B(L) = near * blur(L) + far * mean(L) is the light that
-bounced, with the shares `near` and `far` that the scene network reads from the photo. Equal lights return
-the photo, bit for
-bit.
+S and T are the source and target Lumi maps, B(L) = near * blur(L) + far * mean(L) is the
+bounced light, with the shares `near` and `far` that the scene network reads from the photo. Equal lights
+return the photo, bit for bit.
 """
 
 from __future__ import annotations

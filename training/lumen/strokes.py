@@ -1,9 +1,10 @@
-"""The form in which the network receives strokes. A drawing has one blend mode; several modes take several
-runs.
+"""The form in which the network receives strokes.
 
-set        the light under the strokes is what was drawn
-add        one more lamp: the light under the strokes is the photo's own plus what was drawn
-multiply   a flag or a gel: the light under the strokes is the photo's own times what was drawn
+A drawing has one blend mode. Strokes of several modes are run as several drawings.
+
+    set        the light under the strokes is the drawn light
+    add        one more lamp: the light under the strokes is the photo's own plus the drawn light
+    multiply   a flag or a gel: the light under the strokes is the photo's own times the drawn factor
 """
 
 from __future__ import annotations

@@ -55,8 +55,9 @@ class Divide(nn.Conv2d):
 
 
 class Refine(nn.Module):
-    """Add a function of the neighbourhood to every cell's features: (B, C, h, w) -> (B, C, h, w). Zero at
-    first.
+    """Add a function of the neighbourhood to every cell's features: (B, C, h, w) -> (B, C, h, w).
+
+    Zero at first.
     """
 
     def __init__(self, size: int) -> None:

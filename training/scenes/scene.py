@@ -22,8 +22,9 @@ SOURCES = 4  # local sources per scene, besides the dome
 
 @dataclass(frozen=True)
 class Material:
-    """The material of a surface. finish: the coating of the reflectance (T, T, 3). roughness: 0 mirror .. 1
-    matte.
+    """The material of a surface.
+
+    finish: the coating of the reflectance (T, T, 3). roughness: 0 mirror .. 1 matte.
 
     relief: heights (T, T) of a bumped surface, in units. Their slopes tilt the normals, also those of Lumi
     maps.
@@ -43,8 +44,9 @@ class Thing:
 
 @dataclass(frozen=True)
 class Source:
-    """One light of radiance 1; a spot is a point of intensity 1. `target`: the point that panel and spot
-    face.
+    """One light of radiance 1; a spot is a point of intensity 1.
+
+    `target`: the point that panel and spot face.
 
     size: a sphere's radius; half a square panel's side; a spot's half angle in degrees. A dome shines from
     everywhere and has neither place nor size. The same holds for a sky, whose radiance is its panorama (H,
@@ -231,7 +233,7 @@ def _sources(rng: Generator, kind: str, cameras: tuple[Camera, ...]) -> list[Sou
 
 
 def unseen(sources: Iterator[Source], cameras: tuple[Camera, ...]) -> Iterator[Source]:
-    """Return the sources that lie outside every camera's view."""
+    """Yield the sources that lie outside every camera's view."""
     for source in sources:
         radius = (
             0.0 if source.kind == "spot" else source.size * (np.sqrt(2) if source.kind == "panel" else 1.0)
