@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeGuard, Unpack, cast
+from typing import Any, TypeGuard, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,14 @@ from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.images.arrays import (
     Picture,
     check_same_shape,
-    in_primaries_of,
     like_photo,
+    primaries_of,
     read_pixels,
     read_strokes,
+    to_8_bits,
+    to_primaries,
 )
+from dior_rt.images.primaries import Matrix, conversion, srgb
 from dior_rt.kernels import KernelError, Stroke, Strokes, open_ops
 from dior_rt.kernels.types import STRONGEST
 from dior_rt.light import decode_small
@@ -161,12 +164,13 @@ class Relighter:
             "ops": self.ops,
         }
 
-    def open(self, photo: Picture) -> OpenPhoto:
+    def open(self, photo: Picture, primaries: Matrix | None = None) -> OpenPhoto:
         """Prepare a photo to be relit many times. Whatever depends only on the photo is computed once.
 
-        photo: as `relight` takes it. Raises InputError.
+        photo: as `relight` takes it. primaries: the photo's own, to which drawn light is converted; None:
+        those of a Pillow image's profile, else sRGB's. Raises InputError.
         """
-        return OpenPhoto(self, photo)
+        return OpenPhoto(self, photo, primaries)
 
     def relight(
         self,
@@ -321,10 +325,12 @@ class OpenPhoto:
     photo: as it was given. size: (rows, columns).
     """
 
-    def __init__(self, relighter: Relighter, photo: Picture) -> None:
+    def __init__(self, relighter: Relighter, photo: Picture, primaries: Matrix | None = None) -> None:
+        """primaries: as `Relighter.open` takes them."""
         self.photo = photo
         self._relighter = relighter
         self._pixels = read_pixels(photo)
+        self._primaries = primaries_of(photo) if primaries is None else primaries
         self.size: tuple[int, int] = self._pixels.shape[:2]
         self._raster = relighter._family.raster(*self.size)
         self._small: dict[int, NDArray] = {}
@@ -379,8 +385,8 @@ class OpenPhoto:
             if longest not in self._small:
                 if len(self._small) >= MOST_SIZES:
                     self._small.clear()
-                # The picture is only for viewing, so Pillow's fast mean of the encoded values is sufficient.
-                image = Image.fromarray(_to_8_bits(self._pixels))
+                # For the eye alone, so Pillow's fast mean of the encoded values will do.
+                image = Image.fromarray(to_8_bits(self._pixels))
                 reduced = image.resize((width, height), Image.Resampling.BOX, reducing_gap=2.0)
                 self._small[longest] = np.asarray(reduced)
             return self._small[longest]
@@ -401,8 +407,8 @@ class OpenPhoto:
     def _reduced(self) -> tuple[Array, Array]:
         relighter = self._relighter
         source, encoded = relighter._family.reduce_photo(self._pixels, self._raster, relighter._ops)
-        # The network sees nothing brighter than white. Its ratio at white also serves brighter light.
-        return np.minimum(source, np.float32(1)), encoded
+        # The network sees nothing brighter than white; its ratio at white also serves brighter light.
+        return source.clip(max=1), encoded
 
     @cached_property
     def _source_map(self) -> Array:
@@ -446,7 +452,7 @@ class OpenPhoto:
             if reach is not None:
                 lights = [replace(light, reach=light.reach or reach) for light in lights]
             return self._compose(lights, intensity)
-        strokes = in_primaries_of(self.photo, cast("Strokes | Sequence[Stroke] | Picture", lights))
+        strokes = to_primaries(lights, self._primaries)
         drawn = self._relighter._reduce_strokes(strokes, self.size, self._raster, intensity)
         near = None if reach is None else closeness(drawn.mask > 0, reach)
         return Composed(drawn, near)
@@ -457,7 +463,7 @@ class OpenPhoto:
         if not any(layer.coverage.any() for layer in covers):  # the source map is computed only on demand
             nothing = np.zeros((*self._raster, 3), np.float32)
             return Composed(Strokes(nothing, nothing[..., 0]), None)
-        return compose(self._source_map, lights, covers)
+        return compose(self._source_map, lights, covers, conversion(srgb(), self._primaries))
 
     def _cover(self, drawn: Strokes | tuple[Stroke, ...]) -> Cover:
         """Return the layer on the light grid.
@@ -476,14 +482,6 @@ class OpenPhoto:
         with self._lock:
             self._covers = [(drawn, layer), *self._covers[: MOST_COVERS - 1]]
         return layer
-
-
-def _to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
-    if pixels.dtype == np.uint8:
-        return pixels
-    if pixels.dtype == np.uint16:
-        return (pixels >> 8).astype(np.uint8)
-    return (np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _are_layers(lights: Drawing) -> TypeGuard[Sequence[Light]]:

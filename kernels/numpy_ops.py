@@ -18,7 +18,7 @@ from dior_rt.kernels.transfer import EPSILON, LIGHTNESS, SIGMA, rough_reciprocal
 from dior_rt.kernels.types import FloatArray, Picture, Stroke, Strokes
 
 #: Pixels in a band, so that a band stays in the processor's cache.
-BAND = 1 << 16
+BAND = 1 << 14
 MOST_THREADS = 16
 
 

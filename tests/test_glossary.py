@@ -51,10 +51,7 @@ TENSOR_FILES = (
 
 #: Identifiers that still wait for a new name. The list only ever gets shorter.
 WAITING = {
-    ("dior_rt/batch/plan.py", "ours"),
     ("dior_rt/cli/__init__.py", "told"),
-    ("dior_rt/cli/about.py", "own"),
-    ("dior_rt/cli/defaults.py", "known"),
     ("dior_rt/images/exr.py", "_hushed"),
     ("dior_rt/images/exr.py", "given"),
     ("dior_rt/images/photo.py", "given"),

@@ -11,8 +11,12 @@ import typer
 
 from dior_rt.errors import InputError
 from dior_rt.extras import needs_extra
+from dior_rt.training.blender.command import app as blender
+from dior_rt.training.lumen.command import app as lumen
 
 app = typer.Typer(no_args_is_help=True, help="Render scenes and train the network (needs dior-rt[train]).")
+app.add_typer(blender, name="blender")
+app.add_typer(lumen, name="lumen")
 
 
 Precision = Annotated[Literal["no", "bf16"], typer.Option(help="bf16 where the processor or GPU has it.")]

@@ -18,6 +18,7 @@ from dior_rt.images.encoding import PLAIN, Encoding
 from dior_rt.images.photo import check_output, read_photo, write_photo
 from dior_rt.images.sidecar import write_sidecar
 from dior_rt.images.strokes import Key, read_drawing
+from dior_rt.project import SUFFIX, read_project
 
 if TYPE_CHECKING:
     from dior_rt.relight import Relighter
@@ -74,7 +75,10 @@ def relight_file(
         drawing = read_drawing(job.strokes, picture.size, recipe.key, primaries=picture.primaries)
         with turn or nullcontext():
             relit = relighter.relight(
-                picture.pixels, drawing.strokes, progress=lambda step, steps: not stopped(), **recipe.options
+                picture.pixels,
+                drawing.strokes,
+                progress=lambda step, steps: not stopped(),
+                **_options(job, recipe),
             )
         settings = relighter.facts() | relit.facts()
         if recipe.sidecar:
@@ -99,3 +103,14 @@ def relight_file(
         return Outcome(job, str(InputError(f"Cannot read {job.photo} or {job.strokes}: {reason(error)}.")))
     except Exception as error:  # an error in one photo must not end the work on the others
         return Outcome(job, f"An unexpected error: {type(error).__name__}: {error}")
+
+
+def _options(job: Job, recipe: Recipe) -> dict[str, Any]:
+    """The options of `Relighter.relight`; a project's settings hold where the batch leaves them open."""
+    options = dict(recipe.options)
+    if job.strokes.suffix.lower() == SUFFIX:
+        settings = read_project(job.strokes).settings
+        for name in ("preset", "steps", "seed"):
+            options[name] = options.get(name) or getattr(settings, name)
+        options["intensity"] = options.get("intensity", 1.0) * settings.intensity
+    return options

@@ -107,6 +107,21 @@ def export(
                 overwrite=overwrite,
                 progress=_show,
             )
+    elif (source / "state.json").is_file():
+        if lora or few_steps or free_steps or prompt_cache or transformer or vae or text_encoder:
+            raise InputError(f"{source} is a run of lumen, and takes no LoRA and no option of Qwen's.")
+        if weights not in ("fp16", "fp32"):
+            raise InputError(f"A run of lumen is stored as fp16 or fp32, not {weights}.")
+        with needs_extra("export"):
+            from dior_rt.export.lumen import LumenExportConfig, export_lumen
+
+            settings = LumenExportConfig(
+                schedule=_schedule(3.0 if shift is None else shift),
+                steps=steps,
+                guidance=1.0 if guidance is None else guidance,
+                noise_scale=1.0 if noise_scale is None else noise_scale,
+            )
+            bundle = export_lumen(source, out, config=settings, weights=weights, overwrite=overwrite)
     else:
         files = transformer or vae or text_encoder
         if few_steps or free_steps or prompt_cache or files or weights == "int4":

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dior_rt.errors import InputError
+from dior_rt.images.arrays import to_8_bits
 from dior_rt.images.photo import Photo
 from dior_rt.kernels import NumpyOps, Strokes
 from dior_rt.lights import Light
@@ -66,7 +67,7 @@ def _rgba(light: Light, size: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def _ora(photo: Photo, lights: Sequence[Light], pictures: Sequence[bytes]) -> bytes:
-    pixels = photo.pixels if photo.pixels.dtype == np.uint8 else (photo.pixels >> 8).astype(np.uint8)
+    pixels = to_8_bits(photo.pixels)
     height, width = photo.size
     names = [f"data/light{i}.png" for i in range(len(lights))]
     stack = "\n".join(

@@ -18,6 +18,7 @@ from PIL import Image
 from dior_rt.desk.jobs import Job, Queue
 from dior_rt.drawing import Painter
 from dior_rt.errors import Cancelled, InputError
+from dior_rt.images.arrays import to_8_bits
 from dior_rt.images.photo import Photo, read_photo, write_photo
 from dior_rt.kernels import Strokes
 from dior_rt.lights import Light
@@ -111,7 +112,7 @@ class Studio:
             digest,
             name,
             photo,
-            self.relighter.open(photo.pixels),
+            self.relighter.open(photo.pixels, photo.primaries),
             Painter(photo.size, kept=64),
             threading.Lock(),
         )
@@ -191,7 +192,6 @@ def encode_jpeg(pixels: NDArray, photo: Photo) -> bytes:
 
 def shrink(photo: Photo, longest: int) -> NDArray[np.uint8]:
     """Return a photo's pixels for the page: uint8, at most `longest` per side."""
-    pixels = photo.pixels if photo.pixels.dtype == np.uint8 else (photo.pixels >> 8).astype(np.uint8)
-    image = Image.fromarray(pixels)
+    image = Image.fromarray(to_8_bits(photo.pixels))
     image.thumbnail((longest, longest), Image.Resampling.BOX, reducing_gap=2.0)
     return np.asarray(image)

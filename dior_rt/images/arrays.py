@@ -43,6 +43,15 @@ def read_pixels(photo: Picture) -> NDArray:
     return pixels
 
 
+def to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
+    """Return a photo's pixels for viewing: uint8, clipped at display white."""
+    if pixels.dtype == np.uint8:
+        return pixels
+    if pixels.dtype == np.uint16:
+        return (pixels >> 8).astype(np.uint8)
+    return (np.clip(pixels, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def like_photo(pixels: NDArray, photo: Picture) -> Picture:
     """Return the pixels as the photo's kind: a Pillow image gets the photo's alpha, and its ICC and EXIF
     data.
@@ -50,12 +59,21 @@ def like_photo(pixels: NDArray, photo: Picture) -> Picture:
     return image_of(photo_of(photo), pixels) if isinstance(photo, Image.Image) else pixels
 
 
+def primaries_of(photo: Picture) -> Matrix:
+    """Return the primaries that a Pillow image's profile names, or those of sRGB for an array."""
+    return photo_of(photo).primaries if isinstance(photo, Image.Image) else srgb()
+
+
 def in_primaries_of(photo: Picture, strokes: Any) -> Any:
-    """Return strokes of any kind with their light in the primaries of a photo, which a Pillow image may name.
+    """Return strokes of any kind with their light in a photo's primaries, which a Pillow image may name."""
+    return to_primaries(strokes, primaries_of(photo))
+
+
+def to_primaries(strokes: Any, target: Matrix) -> Any:
+    """Return strokes of any kind with their light in the target's primaries.
 
     Arrays, Strokes and Stroke use the primaries of sRGB. A Pillow image of strokes uses those of its profile.
     """
-    target = photo_of(photo).primaries if isinstance(photo, Image.Image) else srgb()
     if isinstance(strokes, Image.Image):
         _check_8_bit(strokes)
         return convert_raster(_read_rgba(strokes), conversion(photo_of(strokes).primaries, target))

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain, groupby
 from operator import itemgetter
 from pathlib import Path
@@ -44,7 +44,7 @@ from dior_rt.images.primaries import Matrix, conversion, convert, srgb
 from dior_rt.kernels import NumpyOps, Stroke, Strokes
 from dior_rt.kernels.color import srgb_to_linear
 from dior_rt.kernels.types import FARTHEST
-from dior_rt.lights import BLENDS, Blend, Light
+from dior_rt.lights import BLENDS, Blend, Light, convert_lights
 from dior_rt.records import read_json
 
 Key = Literal["black"]
@@ -87,11 +87,12 @@ def read_drawing(
     lights where any of them blends; a project is returned as its lights. Raises InputError for a file that
     cannot be read or makes no sense.
     """
-    if path.suffix.lower() == project.SUFFIX:
-        return DrawingFile(project.lights_of(project.read_project(path), photo_size))
     target = srgb() if primaries is None else primaries
+    if path.suffix.lower() == project.SUFFIX:
+        lights = project.lights_of(project.read_project(path), photo_size)
+        return DrawingFile(convert_lights(lights, conversion(srgb(), target)))
     if path.suffix.lower() == ".json":
-        return DrawingFile(_convert_json(_read_json(path, photo_size), conversion(srgb(), target)))
+        return DrawingFile(_read_json(path, photo_size, conversion(srgb(), target)))
     raster = _read_raster(path, "strokes", photo_size, page)
     pixels = raster.pixels
     if key == "black":
@@ -288,7 +289,8 @@ def _write_npy(path: Path, array: NDArray[np.float32]) -> None:
         np.save(file, array.astype(np.float32, copy=False), allow_pickle=False)
 
 
-def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke] | list[Light]:
+def _read_json(path: Path, photo_size: tuple[int, int], matrix: Matrix | None) -> list[Stroke] | list[Light]:
+    """matrix: from sRGB's primaries to the photo's."""
     check_readable(path, "strokes")
     try:
         document = read_json(path, _MOST_JSON_BYTES)
@@ -306,22 +308,10 @@ def _read_json(path: Path, photo_size: tuple[int, int]) -> list[Stroke] | list[L
                 blends.append(_blend(item))
             except (ValueError, OverflowError) as error:
                 raise ValueError(f"stroke {i}: {error}") from error
+        strokes = convert_strokes(strokes, matrix)
         return _layers(strokes, blends) if set(blends) - {"set"} else strokes
     except (OSError, ValueError, OverflowError) as error:
         raise InputError(f"Cannot read the strokes {path}: {reason(error)}.") from error
-
-
-def _convert_json(drawing: list[Stroke] | list[Light], change: Matrix | None) -> list[Stroke] | list[Light]:
-    """Return strokes, or layers of them, converted to other primaries."""
-    layers = [one for one in drawing if isinstance(one, Light)]
-    if layers:
-        return [replace(one, drawn=tuple(convert_strokes(list(_lines(one)), change))) for one in layers]
-    return convert_strokes([one for one in drawing if isinstance(one, Stroke)], change)
-
-
-def _lines(light: Light) -> tuple[Stroke, ...]:
-    assert isinstance(light.drawn, tuple)
-    return light.drawn
 
 
 def _blend(item: dict[str, Any]) -> Blend:

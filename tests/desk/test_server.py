@@ -255,6 +255,25 @@ def test_a_deep_photo_keeps_its_16_bits(client, tmp_path):
     assert out.dtype == np.uint16 and out[:32].mean() > deep[:32].mean()
 
 
+def test_a_float_photo_is_shown_and_lit(client, tmp_path):
+    import OpenEXR
+
+    light = np.full((40, 60, 3), 0.2, np.float32)
+    light[:10] = 3
+    OpenEXR.File({}, {"RGB": light}).write(str(tmp_path / "bright.exr"))
+    shown = client.post("api/photos?name=bright.exr", content=(tmp_path / "bright.exr").read_bytes()).json()
+    assert shown["bits"] == 32
+    assert pixels(client.get(f"api/photos/{shown['id']}/picture"))[2, 2].min() >= 254
+    wanted = project(
+        {**LIGHT, "reach": None, "shapes": [{**STROKE, "points": [[20, 30], [40, 30]]}]},
+        steps=1,
+        size=(60, 40),
+    )
+    job = relit(client, shown["id"], wanted)
+    assert pixels(client.get(f"api/jobs/{job}/picture")).shape == (40, 60, 3)
+    assert client.post(f"api/photos/{shown['id']}/layers?kind=ora", json=wanted).status_code == 200
+
+
 def test_lights_are_layers_for_other_programs(client, photo, tmp_path):
     lights = project(LIGHT, {**LIGHT, "name": "Flag <&> 2", "blend": "multiply", "on": False})
     ora = client.post(f"api/photos/{photo}/layers?kind=ora", json=lights).content

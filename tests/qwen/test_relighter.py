@@ -59,7 +59,7 @@ def test_a_photo_is_shrunk_as_diffusers_processor_does(relighter, pipes, size):
     raster = family.raster(*size)
     canvas = edit_plus.calculate_dimensions(edit_plus.VAE_IMAGE_SIZE, size[1] / size[0])[::-1]
     assert tuple(canvas) == raster
-    _, seen = relighter._reduce_photo(photo, raster)
+    _, seen = relighter._family.reduce_photo(photo, raster, relighter._ops)
     wanted = pipe.image_processor.preprocess(Image.fromarray(photo), *canvas)
     codes = (np.rint(picture * 255) for picture in (seen.transpose(2, 0, 1), (wanted[0].numpy() + 1) / 2))
     np.testing.assert_array_equal(*codes)

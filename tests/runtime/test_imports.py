@@ -7,7 +7,7 @@ WALK = """
 import importlib, pkgutil, sys
 import dior_rt, dior_rt.kernels
 
-OTHERS = ("dior_rt.export", "dior_rt.training", "dior_rt.__main__")
+OTHERS = ("dior_rt.export", "dior_rt.training", "dior_rt.__main__", "dior_rt.batch.ray_engine")
 for package in (dior_rt, dior_rt.kernels):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         if not module.name.startswith(OTHERS):

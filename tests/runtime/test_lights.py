@@ -7,9 +7,12 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dior_rt.errors import InputError
-from dior_rt.images.strokes import read_strokes
+from dior_rt.images.primaries import DISPLAY_P3, SRGB_TAG, conversion, make_profile, srgb, to_xyz
+from dior_rt.images.strokes import read_drawing, read_strokes
 from dior_rt.kernels import NumpyOps, Stroke, Strokes
-from dior_rt.lights import LEAST_COVERAGE, Light, compose, cover
+from dior_rt.kernels.types import STRONGEST
+from dior_rt.lights import LEAST_COVERAGE, Light, compose, convert_lights, cover
+from dior_rt.project import LightRecord, PhotoRef, Project, ShapeRecord, lights_of, write_project
 from dior_rt.relight import NOTHING_DRAWN, Relighter
 
 GRID = (4, 6)
@@ -118,6 +121,12 @@ def test_light_too_strong_for_float32_is_refused():
         composed(Light(drawn((3e38, 1, 1)), "set", strength=10))
 
 
+def test_light_is_bounded_as_it_is_for_strokes():
+    assert composed(Light(drawn((STRONGEST / 2, 1, 1)), "set")).target.light.max() == STRONGEST / 2
+    with pytest.raises(InputError, match="too strong"):
+        composed(Light(drawn((STRONGEST / 2, 1, 1)), "set", strength=3))
+
+
 # On a photo, with the weights that ship
 
 
@@ -184,6 +193,66 @@ def test_lights_that_are_all_off_leave_the_photo_unchanged(relighter, photo):
 def test_strokes_and_lights_in_one_list_are_refused(relighter, photo):
     with pytest.raises(InputError, match="not both"):
         relighter.relight(photo, [lamp(), Stroke(((1, 1),), 3)])
+
+
+# Photos with other primaries
+
+P3 = to_xyz(DISPLAY_P3)
+TO_P3 = conversion(srgb(), P3)
+
+
+@pytest.mark.parametrize("blend", ["set", "add", "multiply"])
+def test_lights_are_drawn_in_the_primaries_of_the_photo(relighter, photo, blend):
+    """In sRGB's primaries, whether the image names its own, the caller does, or the lights come converted."""
+    lights = [lamp(blend, (2.0, 0.5, 0.1), tint=(0.5, 1.0, 0.25))]
+    image = Image.fromarray(photo)
+    image.info["icc_profile"] = make_profile(DISPLAY_P3, SRGB_TAG)
+    named = relighter.open(image).target_map(lights)
+    asked = relighter.open(photo, P3).target_map(lights)
+    converted = relighter.open(photo).target_map(convert_lights(lights, TO_P3))
+    plain = relighter.open(photo).target_map(lights)
+    np.testing.assert_allclose(named.light, asked.light, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(asked.light, converted.light, rtol=1e-4, atol=1e-5)
+    assert np.abs(asked.light - plain.light).max() > 0.01
+    if blend == "set":
+        inside = drawn(size=(60, 90), rows=slice(10, 25))
+        full = cover(inside, asked.mask.shape).coverage > 0.999
+        np.testing.assert_allclose(
+            asked.light[full], TO_P3 @ (1.0, 0.5, 0.025) + 0 * asked.light[full], rtol=1e-3
+        )
+
+
+def test_white_light_is_white_in_all_primaries(relighter, photo):
+    lights = [lamp("add", (2.0, 2.0, 2.0)), lamp("multiply", (0.5, 0.5, 0.5))]
+    asked, plain = relighter.open(photo, P3).target_map(lights), relighter.open(photo).target_map(lights)
+    np.testing.assert_allclose(asked.light, plain.light, atol=5e-3)
+
+
+def test_a_project_is_read_in_the_primaries_of_the_photo(tmp_path, relighter, photo):
+    """The command line reads the drawing for a photo; the desk opens the photo. Both give the same."""
+    shape = ShapeRecord("stroke", ((20.0, 20.0), (60.0, 40.0)), color=(1.0, 0.2, 0.0), intensity=3, width=20)
+    layers = (LightRecord("Lamp", "add", tint=(1.0, 0.5, 0.5), shapes=(shape,)), LightRecord("None", "set"))
+    project = Project(PhotoRef((90, 60)), layers)
+    write_project(tmp_path / "a.dior", project)
+    drawing = read_drawing(tmp_path / "a.dior", (60, 90), primaries=P3).strokes
+    command = relighter.relight(photo, drawing, steps=2).picture
+    desk = relighter.open(photo, P3).relight(lights_of(project, (60, 90)), steps=2).picture
+    assert np.abs(command.astype(int) - desk).max() <= 1
+    other = relighter.open(photo).relight(lights_of(project, (60, 90)), steps=2).picture
+    assert np.abs(command.astype(int) - other).max() > 1
+
+
+def test_json_strokes_that_blend_are_converted(tmp_path):
+    path = tmp_path / "strokes.json"
+    path.write_text('[{"points": [[1, 1]], "width": 3, "blend": "add", "color": [1, 0.5, 0]}]')
+    (layer,) = read_drawing(path, (60, 90), primaries=P3).strokes
+    np.testing.assert_allclose(layer.drawn[0].color, TO_P3 @ (1, 0.5, 0), rtol=1e-6)
+
+
+def test_strokes_converted_as_lights_are_converted_as_strokes():
+    (light,) = convert_lights([Light((Stroke(((1, 1),), 3, (1.0, 0.5, 0.25)),), tint=(1.0, 0.5, 1.0))], TO_P3)
+    np.testing.assert_allclose(light.drawn[0].color, TO_P3 @ (1.0, 0.25, 0.25))
+    assert light.tint == (1.0, 1.0, 1.0)
 
 
 def test_json_strokes_that_blend_become_layers(tmp_path, relighter, photo):

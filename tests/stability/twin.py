@@ -116,7 +116,7 @@ def relight(
 ) -> Array:
     """The whole way of a picture: 0..1, not clipped."""
     grid = family.raster(*photo.shape[:2])
-    source = reduce_photo(photo, grid)
+    source = np.minimum(reduce_photo(photo, grid), 1)  # the ratio at white serves brighter light as well
     light, mask = reduce_strokes(strokes.light, strokes.mask, grid)
     drawn = Strokes(light.astype(np.float32), mask.astype(np.float32))
     return transfer(photo, source, relight_grid(family, network, source, drawn, seed, steps, guidance))

@@ -57,7 +57,7 @@ def render(
 
         from dior_rt.training.blender.cycles import ShootOptions
     except ImportError as error:
-        raise MissingExtraError("train render --engine blender", "render") from error
+        raise MissingExtraError("train blender render", "render") from error
     from dior_rt.training.blender.views import Job, render_views
 
     job = Job(out, assets, scenes, seed, parse_shard(shard), split)

@@ -177,7 +177,7 @@ def load_shards(folder: Path) -> Views:
     """Return all views of a folder of shards. Raises InputError where there is none."""
     paths = sorted(folder.glob("shard-*.zip"))
     if not paths:
-        raise InputError(f"There are no shards in {folder}. Make some with `dior-rt train pack`.")
+        raise InputError(f"There are no shards in {folder}. Make some with `dior-rt train lumen pack`.")
     loaded: list[dict[str, Tensor]] = []
     with ThreadPoolExecutor() as pool:
         for path in paths:

@@ -159,3 +159,17 @@ def test_killed_in_the_middle_it_goes_on_and_ends_as_if_it_had_not_been(
     )
     for i in range(12):
         assert Path(f"out/{i}.png").read_bytes() == Path(f"whole/{i}.png").read_bytes()
+
+
+def test_a_project_of_the_light_desk_is_relit_by_its_settings(batch: Batch, model: list[str]) -> None:
+    from dior_rt.project import LightRecord, PhotoRef, Project, Settings, ShapeRecord, write_project
+
+    stroke = ShapeRecord("stroke", ((10.0, 10.0), (40.0, 20.0)), intensity=3.0, width=12.0)
+    project = Project(PhotoRef((60, 40)), (LightRecord(shapes=(stroke,)),), Settings(steps=2, seed=5))
+    Path("in/0-light.png").unlink()
+    write_project(Path("in/0.dior"), project)
+    code, report = batch()
+    assert code == 0 and report["relit"] == 3
+    assert run(["relight", "in/0.png", "in/0.dior", "-o", "0.png", *model]) == 0
+    np.testing.assert_array_equal(pixels("out/0.png"), pixels("0.png"))
+    assert (pixels("out/0.png") != pixels("in/0.png")).any()

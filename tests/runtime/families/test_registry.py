@@ -60,7 +60,7 @@ def test_every_built_in_family_names_a_class_that_is_there() -> None:
     for place in BUILT_IN.values():
         module, _, name = place.partition(":")
         assert isinstance(getattr(__import__(module, fromlist=[name]), name), type)
-    assert family_names()[:2] == ("mini", "qwen")
+    assert family_names()[:3] == ("mini", "lumen", "qwen")
 
 
 def test_an_installed_package_adds_a_family(mini_bundle: Path, tmp_path: Path, installed: None) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.ndimage import correlate1d
 
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
-from dior_rt.training import network
+from dior_rt.training import light
 from dior_rt.training.data.camera import (
     LUMA,
     Camera,
@@ -60,7 +60,7 @@ def test_the_plain_camera_encodes_to_eight_bits_and_no_more() -> None:
 def test_the_plain_camera_gives_the_codes_that_the_triplets_had() -> None:
     codes = srgb_to_linear(np.arange(256) / 255).astype(np.float32).reshape(16, 16, 1).repeat(3, axis=2)
     ours = Camera().shot(codes, np.random.default_rng(0))
-    theirs = (network.linear_to_srgb(torch.from_numpy(codes)) * 255).round() / 255
+    theirs = (light.linear_to_srgb(torch.from_numpy(codes)) * 255).round() / 255
     np.testing.assert_array_equal(ours, theirs.numpy())
 
 
