@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
 _clone.install()
 
-# ONNX Runtime from 1.29 on reports to its maker, keeps an identifier in the user's cache and looks names up,
-# unless one of these is set before it is imported. Whoever wants that sets them to 0.
+# ONNX Runtime from 1.29 on sends reports to its maker, keeps an identifier in the user's cache and makes DNS
+# queries, unless one of these is set before it is imported. Users who want the reports set them to 0.
 for _name in ("ORT_DISABLE_TELEMETRY", "ORT_TELEMETRY_DISABLED"):
     os.environ.setdefault(_name, "1")
 
@@ -22,7 +22,7 @@ __all__ = ["Relighter", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
-    # ONNX Runtime is loaded only by those who relight: importing dior_rt.kernels alone stays light.
+    # ONNX Runtime is loaded only for relighting, so importing only dior_rt.kernels stays fast.
     if name == "Relighter":
         from dior_rt.relight import Relighter
 

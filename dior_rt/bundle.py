@@ -1,4 +1,4 @@
-"""The bundle: a folder with manifest.json and ONNX files, everything the runtime needs to run one model.
+"""The bundle: a folder with manifest.json and ONNX files, which holds everything needed to run one model.
 
 docs/bundle.md describes the format. Reading checks the whole of it; writing shows all of it or nothing.
 """
@@ -29,7 +29,7 @@ FORMAT: Final = 2
 MANIFEST = "manifest.json"
 MOST_MANIFEST_BYTES = 1 << 20
 MOST_STEPS = 1000
-#: Entries of manifest.json that format 2 requires and that have one value only; nothing depends on them.
+#: The constant entries of manifest.json that format 2 requires. No code depends on them.
 CONSTANTS: Final[dict[str, Any]] = {"colour": "srgb", "settings": {}}
 
 
@@ -46,8 +46,8 @@ class Tensor:
 class Graph:
     """One ONNX graph: its file in the bundle, and its tensors in the order of the graph.
 
-    probe: an .npz in the bundle with one set of inputs and the outputs torch gives for them, by the tensors'
-    names; every device is held to it.
+    probe: an .npz in the bundle with one set of inputs and torch's outputs for them, by the tensors' names.
+    Every device is tested against it.
     """
 
     file: str
@@ -58,7 +58,7 @@ class Graph:
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What manifest.json says. Raises ValueError for values that no bundle can have.
+    """The content of manifest.json. Raises ValueError for values that no bundle can have.
 
     precision: how the weights are stored ("fp32", "fp16", "int4" ...).
     files: relative path -> sha256 in hex, filled in by `write_bundle`.
@@ -97,7 +97,7 @@ class Manifest:
                 raise ValueError(f"{digest[:80]!r} is no sha256")
 
     def graph_files(self) -> list[str]:
-        """The files that the graphs name."""
+        """Return the files that the graphs name."""
         return [file for graph in self.graphs.values() for file in (graph.file, graph.probe) if file]
 
 
@@ -110,18 +110,21 @@ class Bundle:
 
     @property
     def sha256(self) -> str:
-        """The bundle's identity: the hash of its manifest, which holds the hashes of its files."""
+        """Return the bundle's identity: the hash of its manifest, which holds the hashes of its files."""
         return _sha256(self.folder / MANIFEST)
 
     def path(self, graph: str) -> Path:
-        """The ONNX file of the graph of that name; BundleError where there is none."""
+        """Return the path of the ONNX file of a graph, by the graph's name.
+
+        Raises BundleError where there is none.
+        """
         if graph not in self.manifest.graphs:
             raise BundleError(f"The bundle {self.folder} has no graph {graph!r}; export it again.")
         return self.folder / self.manifest.graphs[graph].file
 
 
 def default_bundle() -> Path:
-    """The folder of the bundle that ships in this package; BundleError where the installation lacks it."""
+    """Return the folder of the bundle in this package. Raises BundleError where the installation lacks it."""
     folder = resources.files("dior_rt") / "bundles" / "mini"
     if not isinstance(folder, Path) or not folder.is_dir():
         raise BundleError("This installation has no model in it; reinstall dior-rt, or name a bundle.")
@@ -129,10 +132,10 @@ def default_bundle() -> Path:
 
 
 def read_bundle(folder: Path) -> Bundle:
-    """Read and check a bundle: its manifest's form, and the sha256 of every file.
+    """Read a bundle, and check its manifest's form and the sha256 of every file.
 
-    Raises BundleError for a folder that is missing, altered, incomplete, of an unknown version or family,
-    or whose manifest names a path outside the folder.
+    Raises BundleError for a folder that is missing, altered, incomplete, of an unknown version or family, or
+    whose manifest names a path outside the folder.
     """
     manifest = _read_manifest(folder)
     if unlisted := set(manifest.graph_files()) - manifest.files.keys():
@@ -145,11 +148,11 @@ def read_bundle(folder: Path) -> Bundle:
 def write_bundle(
     folder: Path, manifest: Manifest, files: Mapping[str, Path], *, overwrite: bool = False
 ) -> Bundle:
-    """Write a bundle all at once: what is not complete and checked is never seen at `folder`.
+    """Write a bundle atomically: `folder` never holds one that is incomplete or unchecked.
 
     files: relative path in the bundle -> the file to put there (linked where the file system can, else
-    copied); the manifest's own `files` are filled in from them. A bundle that is there already is replaced
-    only with overwrite=True, and stays until the new one is ready. Raises BundleError.
+    copied). The manifest's `files` are filled in from them. An existing bundle is replaced only with
+    overwrite=True, and stays until the new one is ready. Raises BundleError.
     """
     folder = folder.resolve()
     try:
@@ -167,7 +170,9 @@ def write_bundle(
 
 
 def check_target(folder: Path, overwrite: bool) -> None:
-    """BundleError where `write_bundle` would refuse the place: something is there that it may not replace."""
+    """Raise BundleError where `write_bundle` would refuse the place because it may not replace what is
+    there.
+    """
     if not folder.exists() and not folder.is_symlink():
         return
     if not overwrite:
@@ -203,7 +208,7 @@ def _to_document(manifest: Manifest) -> dict[str, Any]:
 
 
 def _without_constants(document: Any) -> Any:
-    """Return the JSON data without the constants. ValueError where one has another value."""
+    """Return the JSON data without the constants. Raises ValueError where one has another value."""
     if not isinstance(document, dict):
         return document
     for name, value in CONSTANTS.items():
@@ -213,7 +218,9 @@ def _without_constants(document: Any) -> Any:
 
 
 def _check_relative(path: str) -> None:
-    """ValueError unless the path is in its plain form and stays in its folder on every operating system."""
+    """Raise ValueError unless the path is in normal form and stays in its folder on every operating
+    system.
+    """
     plain = PurePosixPath(path)
     if str(plain) != path or plain.is_absolute() or ".." in plain.parts or set(path) & set("\\:\0"):
         raise ValueError(f"{path!r} is no path inside the bundle")
@@ -260,7 +267,8 @@ def _move_into_place(draft: Path, folder: Path) -> None:
     if not folder.exists():
         draft.rename(folder)
     elif not _exchange(draft, folder):
-        # Without an exchange the old bundle steps aside, and comes back should the new one fail to follow.
+        # Where the folders cannot be exchanged, the old bundle is moved aside, and moved back if the new one
+        # cannot take its place.
         old = draft.with_name("old")
         folder.rename(old)
         try:
@@ -271,7 +279,7 @@ def _move_into_place(draft: Path, folder: Path) -> None:
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Swap two folders in one step, with Linux' renameat2; False where the system cannot."""
+    """Swap two folders in one step, with Linux' renameat2. Returns False where the system cannot."""
     try:
         renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
     except (AttributeError, OSError, TypeError):

@@ -1,4 +1,4 @@
-"""What can run the network and the pixel kernels here, each tested, and what "auto" chooses and why."""
+"""Test the devices that can run the network and the pixel kernels here, and explain what "auto" chooses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from dior_rt.providers import PROVIDERS, available, is_built_in
 
 @dataclass(frozen=True)
 class Device:
-    """name: as --device or --ops takes it. problem: why it cannot be used, or None where it passed."""
+    """A device.
+
+    name: as --device or --ops takes it. problem: why it cannot be used, or None where it passed.
+    """
 
     name: str
     description: str
@@ -23,7 +26,7 @@ class Device:
 
 @dataclass(frozen=True)
 class Choice:
-    """What "auto" takes, and why."""
+    """The choice of "auto", and the reason."""
 
     name: str
     reason: str
@@ -38,7 +41,7 @@ class Survey:
 
 
 def survey_network(bundle: Bundle) -> Survey:
-    """Every provider of the installed ONNX Runtime, held to the bundle's own answer."""
+    """Test every provider of the installed ONNX Runtime against the bundle's own answer."""
     graph = next(iter(bundle.manifest.graphs))
     devices = []
     for name in available():
@@ -58,7 +61,7 @@ def survey_network(bundle: Bundle) -> Survey:
 
 
 def survey_ops() -> Survey:
-    """Every OpenCL device, held to the NumPy twin; and NumPy."""
+    """Test every OpenCL device against NumPy, and list NumPy."""
     devices = []
     try:
         for device in list_devices():

@@ -26,7 +26,7 @@ from PIL import Image, ImageDraw
 
 from dior_rt.kernels import Strokes
 
-#: Pixels of the longer side on which shapes are drawn: far finer than a light grid, and bounded.
+#: The pixels of the longer side on which shapes are drawn: far finer than a light grid, and bounded.
 CANVAS: Final = 768
 
 #: Sigma of a fill's soft edge at softness 1, as a share of the fill's longer side.
@@ -41,8 +41,11 @@ Array = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Paint:
-    """What a shape is filled with. color: linear RGB. intensity: multiplies it. flow: coverage of one pass,
-    0..1. softness: 0 hard .. 1. erase: takes away instead."""
+    """The paint of a shape.
+
+    color: linear RGB. intensity: a factor for the color. flow: the coverage of one pass, 0..1. softness: 0
+    hard .. 1. erase: whether the shape takes light away instead.
+    """
 
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     intensity: float = 1.0
@@ -52,17 +55,17 @@ class Paint:
 
     @property
     def light(self) -> Array:
-        """The linear RGB that the shape lays down."""
+        """Return the linear RGB that the shape paints."""
         return np.asarray(self.color, np.float32) * np.float32(self.intensity)
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape in pixels of the photo.
+    """A shape in pixels of the photo.
 
-    points: a stroke's way; a fill's outline; a gradient's two ends; a glow's centre and the ends of its two
-    half axes. width: a stroke's. pressure: 0..1 for each point of a stroke, or empty. thins, fades: whether
-    pressure acts on width, and on flow.
+    points: the path of a stroke; the outline of a fill; the two ends of a gradient; the centre of a glow and
+    the ends of its two half axes. width: the width of a stroke. pressure: 0..1 for each point of a stroke, or
+    empty. thins, fades: whether pressure acts on width, and on flow.
     """
 
     kind: Literal["stroke", "fill", "gradient", "glow"]
@@ -75,7 +78,7 @@ class Shape:
 
 
 def canvas_size(photo: tuple[int, int], longest: int = CANVAS) -> tuple[int, int]:
-    """(rows, columns) of the raster for a photo of (rows, columns)."""
+    """Return (rows, columns) of the raster for a photo of (rows, columns)."""
     scale = min(1.0, longest / max(photo))
     return max(1, round(photo[0] * scale)), max(1, round(photo[1] * scale))
 
@@ -89,13 +92,13 @@ class Canvas:
         self._mask = np.zeros(self.size, np.float32)
 
     def copy(self) -> Canvas:
-        """Another canvas with the same drawing."""
+        """Return another canvas with the same drawing."""
         other = copy(self)
         other._light, other._mask = self._light.copy(), self._mask.copy()
         return other
 
     def draw(self, shape: Shape) -> None:
-        """Lay one shape over what is drawn."""
+        """Draw one shape over the earlier shapes."""
         box, coverage = _COVERAGE[shape.kind](shape, self.size, _scale(self.photo, self.size))
         if coverage.size == 0:
             return
@@ -107,7 +110,7 @@ class Canvas:
             mask += coverage
 
     def strokes(self) -> Strokes:
-        """The drawing as light and mask."""
+        """Return the drawing as light and mask."""
         mask = np.clip(self._mask, 0, 1)
         weight = np.where(mask > 0, mask, 1)[..., None]
         light = np.maximum(self._light, 0) / weight
@@ -115,7 +118,7 @@ class Canvas:
 
 
 def draw(shapes: Sequence[Shape], photo: tuple[int, int], longest: int = CANVAS) -> Strokes:
-    """Rasterise the shapes of one layer for a photo of (rows, columns), at most `longest` pixels a side."""
+    """Rasterise the shapes of one layer for a photo of (rows, columns), at most `longest` pixels per side."""
     canvas = Canvas(photo, longest)
     for shape in shapes:
         canvas.draw(shape)
@@ -124,7 +127,7 @@ def draw(shapes: Sequence[Shape], photo: tuple[int, int], longest: int = CANVAS)
 
 @dataclass
 class _Layer:
-    """A layer that a Painter keeps. settled: a canvas with its first shapes, as many as `count`."""
+    """A layer that a Painter keeps. settled: a canvas with the first `count` shapes of the layer."""
 
     settled: Canvas
     count: int
@@ -133,14 +136,20 @@ class _Layer:
 
 
 class Painter:
-    """Rasters of layers, kept. Only what is new is drawn: the last shape grows while the pen moves."""
+    """A cache of the rasters of layers.
+
+    Only new shapes are drawn: the last shape grows while the pen moves.
+    """
 
     def __init__(self, photo: tuple[int, int], kept: int = 32) -> None:
         self._photo, self._most = photo, kept
         self._layers: dict[str, _Layer] = {}
 
     def draw(self, name: str, shapes: Sequence[Shape]) -> Strokes:
-        """The raster of a layer by its name; the same object as long as its shapes are the same."""
+        """Return the raster of a layer by its name.
+
+        It is the same object as long as the shapes are the same.
+        """
         shapes = tuple(shapes)
         layer = self._layers.pop(name, None)
         if layer is None or layer.shapes != shapes:
@@ -168,7 +177,7 @@ Covered = tuple[Box, Array]
 
 
 def _scale(photo: tuple[int, int], size: tuple[int, int]) -> Array:
-    """Pixels of the canvas in one of the photo's, (across, down)."""
+    """Return the canvas's pixels per pixel of the photo, (across, down)."""
     return np.array([size[1] / photo[1], size[0] / photo[0]])
 
 
@@ -195,7 +204,7 @@ def _stroke(shape: Shape, size: tuple[int, int], scale: Array) -> Covered:
 
 
 def _capsule(box: Box, ends: Array, radii: Array, flows: Array, shape: Shape) -> Array:
-    """Coverage of one piece of a stroke, whose radius and flow change evenly along it."""
+    """Return the coverage of one piece of a stroke, along which radius and flow change linearly."""
     x, y = _centres(box)
     (x0, y0), (dx, dy) = ends[0], ends[1] - ends[0]
     length = dx * dx + dy * dy
@@ -208,14 +217,14 @@ def _capsule(box: Box, ends: Array, radii: Array, flows: Array, shape: Shape) ->
 
 
 def _edge(t: Array, softness: float) -> Array:
-    """A ramp 0..1, which a soft edge leaves and enters smoothly."""
+    """Return a ramp 0..1 for a soft edge. Its slope is 0 at both ends."""
     t = np.clip(t, 0, 1)
     return t + softness * (t * t * (3 - 2 * t) - t)
 
 
 def _fill(shape: Shape, size: tuple[int, int], scale: Array) -> Covered:
     points = np.asarray(shape.points, np.float64) * scale
-    fine = 2  # samples a side of a pixel
+    fine = 2  # samples per side of a pixel
     blur = shape.paint.softness * FILL_BLUR * float(np.ptp(points, axis=0).max(initial=0))
     box = _box(points, 2 * blur + 1, size)
     height, width = (side.stop - side.start for side in box)
@@ -256,7 +265,7 @@ _COVERAGE: Final = {"stroke": _stroke, "fill": _fill, "gradient": _gradient, "gl
 
 
 def _box(points: Array, margin: float, size: tuple[int, int]) -> Box:
-    """The part of the canvas that the points and a margin around them touch; empty where that is none."""
+    """Return the part of the canvas that the points and a margin around them touch. It may be empty."""
     low = np.floor(points.min(axis=0) - margin)
     high = np.ceil(points.max(axis=0) + margin)
     left, top = (int(np.clip(low[i], 0, size[1 - i])) for i in (0, 1))
@@ -265,7 +274,7 @@ def _box(points: Array, margin: float, size: tuple[int, int]) -> Box:
 
 
 def _centres(box: Box) -> tuple[Array, Array]:
-    """x (1, columns) and y (rows, 1) of the pixels' centres."""
+    """Return x (1, columns) and y (rows, 1) of the pixels' centres."""
     y, x = (np.arange(side.start, side.stop) + 0.5 for side in box)
     return x[None, :], y[:, None]
 

@@ -1,4 +1,4 @@
-"""The engine: one ONNX graph on one device, held to the bundle's own answers before it is used."""
+"""The engine: one ONNX graph on one device, tested against the bundle's own answers before it is used."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dior_rt.providers import accelerators, open_session, translated
 
 Feeds = Mapping[str, NDArray]
 
-SELF_TEST_TOLERANCE = 3e-4  # of a row's largest value; float32 keeps 1e-5, TensorFloat-32 does not pass
+SELF_TEST_TOLERANCE = 3e-4  # share of a row's largest value; float32 keeps 1e-5, TensorFloat-32 does not pass
 
 _DTYPES = {
     "tensor(float)": "float32",
@@ -37,7 +37,7 @@ _DTYPES = {
 class Engine:
     """One graph, loaded once. Safe to use from several threads.
 
-    inputs, outputs: the graph's tensors. device: as named. reason: why this device.
+    inputs, outputs: the graph's tensors. device: its name. reason: why this device was chosen.
     """
 
     def __init__(
@@ -50,7 +50,8 @@ class Engine:
     ) -> None:
         """Load `model`. threads, keep: as `open_session` takes them.
 
-        Raises DeviceError for a device that is not there, BundleError for a file that is no ONNX graph.
+        Raises DeviceError for a device that does not exist, and BundleError for a file that is not an ONNX
+        graph.
         """
         self.device = device
         self.reason = reason or f"{device} was asked for"
@@ -69,7 +70,9 @@ class Engine:
         return Binding(self, constants)
 
     def check_process(self) -> None:
-        """Raise DeviceError in a fork of the process that loaded the graph: its threads are not there."""
+        """Raise DeviceError in a fork of the process that loaded the graph, because a fork lacks its
+        threads.
+        """
         if os.getpid() != self._process:
             raise DeviceError(
                 "This model was loaded before the process was forked, and its threads were not copied: load "
@@ -82,7 +85,7 @@ class Engine:
 
 
 class Binding:
-    """An engine with some of its inputs in place. Belongs to one thread."""
+    """An engine with some of its inputs in place. It belongs to one thread."""
 
     def __init__(self, engine: Engine, constants: Feeds) -> None:
         engine.check_process()
@@ -99,7 +102,7 @@ class Binding:
         """Run with the remaining inputs.
 
         Raises InputError where an input is missing, unknown, or of another dtype or shape than the graph's,
-        and DeviceError where the device fails or computes what is no number.
+        and DeviceError where the device fails or computes values that are not finite numbers.
         """
         engine = self._engine
         engine.check_process()
@@ -121,10 +124,11 @@ class Binding:
 def open_engine(
     bundle: Bundle, graph: str, device: str = "auto", threads: int | None = None, *, keep: bool = True
 ) -> Engine:
-    """Load a graph of a bundle on a device, and hold it to the bundle's own answer.
+    """Load a graph of a bundle on a device, and test it against the bundle's own answer.
 
-    "auto" takes the first accelerator that is there and computes right, else the CPU; `engine.reason` says
-    why. Raises DeviceError for a device that is not there or computes wrong results, and BundleError.
+    "auto" takes the first available accelerator that computes correctly, else the CPU; `engine.reason`
+    explains the choice. Raises DeviceError for a device that does not exist or computes wrong results, and
+    BundleError.
     """
     if device != "auto":
         return _open_tested(bundle, graph, device, threads, keep=keep)
@@ -141,7 +145,9 @@ def open_engine(
 
 
 def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
-    """InputError unless the arrays fit: names, dtypes, ranks, fixed sides, and sides that share a name."""
+    """Raise InputError unless the arrays fit: names, dtypes, ranks, fixed sides, and sides that share a
+    name.
+    """
     expected = {tensor.name for tensor in inputs}
     if expected != feeds.keys():
         raise InputError(f"The network expects {sorted(expected)} and got {sorted(feeds)}.")
@@ -161,7 +167,7 @@ def check_feeds(inputs: tuple[Tensor, ...], feeds: Feeds) -> None:
 
 
 def _multiple(side: int | str) -> int:
-    """Of what a side must be a multiple: 4 for the side "4*rows"."""
+    """Return the number that a side must be a multiple of, such as 4 for the side "4*rows"."""
     factor, star, _ = str(side).partition("*")
     return int(factor) if star and factor.isdecimal() else 1
 
@@ -181,7 +187,7 @@ def _open_tested(
 
 
 def _self_test(engine: Engine, probe: Path) -> None:
-    """Hold the engine to the probe: an .npz of the graph's inputs and of the outputs they have in torch."""
+    """Test the engine with the probe: an .npz of the graph's inputs and of torch's outputs for them."""
     try:
         with np.load(probe, allow_pickle=False) as arrays:
             feeds = {tensor.name: arrays[tensor.name] for tensor in engine.inputs}
@@ -189,7 +195,8 @@ def _self_test(engine: Engine, probe: Path) -> None:
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise BundleError(f"Cannot read the self-test {probe}: {reason(error)}.") from error
     for name, got in engine.run(feeds).items():
-        # Row by row, since a batch's answers may differ in size by a thousand.
+        # Rows are compared one by one, because a batch's answers may differ in size by a factor of a
+        # thousand.
         want, within = wanted[name], tuple(range(1, got.ndim))
         error_here = (np.abs(got - want).max(within) / np.maximum(np.abs(want).max(within), 1e-6)).max()
         if not error_here <= SELF_TEST_TOLERANCE:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 
 class DiorError(Exception):
-    """Base of all; its text is one sentence for a person."""
+    """The base of all errors of this package. Its text is one sentence for the user."""
 
 
 class InputError(DiorError):
@@ -26,7 +26,7 @@ class BundleError(DiorError):
 
 
 class DeviceError(DiorError):
-    """A device that is not there, or that computes wrong results."""
+    """A device that does not exist, or that computes wrong results."""
 
 
 class MissingExtraError(DiorError):

@@ -1,4 +1,4 @@
-"""Commands whose packages come with an extra."""
+"""Report the missing packages of an extra."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from dior_rt.errors import MissingExtraError
 
 @contextmanager
 def needs_extra(name: str, command: str | None = None) -> Iterator[None]:
-    """Turn a package that is missing in the block into MissingExtraError.
+    """Turn a missing package in the block into MissingExtraError.
 
-    name: of the extra, and of the command unless that is given.
+    name: the name of the extra, and of the command where no other is passed.
     """
     try:
         yield
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] == "dior_rt":  # ours is never missing but by mistake
+        if (error.name or "").partition(".")[0] == "dior_rt":  # a bug, not a missing extra
             raise
         raise MissingExtraError(command or name, name) from error

@@ -1,4 +1,4 @@
-"""Writing a file all at once or not at all."""
+"""Write a file all at once or not at all."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from dior_rt.errors import InputError
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A binary file that takes its place at `path` when the block ends well, and else leaves nothing behind.
+    """Yield a binary file that moves to `path` when the block succeeds, and is removed when it fails.
 
     Raises InputError, with the reason, where the folder cannot be written or the disk is full.
     """
     try:
-        target = path.resolve()  # through a symbolic link, so that the link stays one
-        # A short name of its own: the target's may be as long as names can be. Not tempfile: its files are
-        # private to the user, ours gets the permissions of any new file, or of the one that it replaces.
+        target = path.resolve()  # write through a symbolic link, so that the link remains a link
+        # The draft gets a short name, because the target's may be as long as names can be. It is not made by
+        # tempfile, whose files are private to the user: this file gets the permissions of any new file, or
+        # of the file that it replaces.
         draft = target.with_name(f".{secrets.token_hex(8)}.part")
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(f"Cannot write {path}: {reason(error)}.") from error
@@ -42,7 +43,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 
 def remove_drafts(folder: Path) -> None:
-    """Remove what `replacing` left in a folder where its process was killed."""
+    """Remove the drafts of `replacing` in a folder where its process was killed."""
     with contextlib.suppress(OSError):
         for draft in folder.glob(".*.part"):
             if re.fullmatch(r"\.[0-9a-f]{16}\.part", draft.name):
@@ -50,7 +51,7 @@ def remove_drafts(folder: Path) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder, and those above it, unless it is there. Raises InputError where that cannot be."""
+    """Make a folder and its parents unless they exist. Raises InputError where that fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
@@ -58,7 +59,7 @@ def make_folder(path: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise InputError now if `replacing(path)` would fail later, as far as can be known."""
+    """Raise InputError now if `replacing(path)` would fail later, as far as that can be checked."""
     try:
         target = path.resolve()
         if not target.parent.is_dir():
@@ -80,7 +81,7 @@ def check_writable(path: Path) -> None:
 
 
 def check_free(path: Path, overwrite: bool) -> None:
-    """Raise InputError where a file is there already, unless it may be replaced."""
+    """Raise InputError where a file exists already, unless it may be replaced."""
     if not overwrite and is_there(path):
         raise InputError(f"{path} is there already. Give --overwrite to replace it, or name another file.")
 
@@ -105,7 +106,10 @@ def check_readable(path: Path, what: str) -> None:
 
 
 def is_there(path: Path) -> bool:
-    """Whether a path leads to something; False for one that cannot be followed, whose use says why."""
+    """Return whether a path leads to something.
+
+    Returns False for a path that cannot be followed; using it raises an error that says why.
+    """
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -113,7 +117,7 @@ def is_there(path: Path) -> bool:
 
 
 def is_same_file(one: Path, other: Path) -> bool:
-    """Whether two paths lead to one file; False where one of them leads nowhere or cannot be followed."""
+    """Return whether two paths lead to one file. False where one leads nowhere or cannot be followed."""
     try:
         return one.samefile(other)
     except (OSError, ValueError):
@@ -121,7 +125,9 @@ def is_same_file(one: Path, other: Path) -> bool:
 
 
 def reason(error: BaseException) -> str:
-    """What a library's error says, as the end of a sentence: its first line, without a full stop."""
+    """Return the message of a library's error, as the end of a sentence: its first line, without a full
+    stop.
+    """
     text = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
     starts_as_a_sentence = text.partition(" ")[0][1:].islower()
     return (text[:1].lower() + text[1:] if starts_as_a_sentence else text).rstrip(".")

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class GridRule:
-    """How large a light grid a photo gets.
+    """The rule for the size of a photo's light grid.
 
-    cells: about how many cells in all; multiple: both sides are multiples of it (the network's patch);
-    longest: no side is longer, however stretched the photo.
+    cells: the approximate number of cells. multiple: both sides are multiples of it (the network's patch).
+    longest: the longest side allowed, however elongated the photo is.
     """
 
     cells: int = 4096
@@ -19,7 +19,8 @@ class GridRule:
     longest: int = 256
 
     def shape(self, height: int, width: int) -> tuple[int, int]:
-        """The (rows, columns) of the grid of a photo of height x width pixels, nearest to its aspect ratio.
+        """Return the (rows, columns) of the grid of a photo of height x width pixels, nearest to its aspect
+        ratio.
 
         >>> GridRule().shape(1000, 1000), GridRule().shape(2000, 3000), GridRule().shape(1, 4000)
         ((64, 64), (52, 80), (4, 256))

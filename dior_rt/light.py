@@ -22,12 +22,12 @@ from dior_rt.kernels.transfer import EPSILON
 
 Array = NDArray[np.float32]
 
-#: Light, as a share of display white, that a quotient adds to both of its sides: black can be lit, and the
-#: dark parts of a photo are not trusted below it.
+#: Light, as a share of display white, that is added to both sides of a quotient. Black can then be lit, and
+#: the dark parts of a photo below it have little influence.
 FLOOR: Final = EPSILON
 #: Scale of the logarithm in which light is encoded: log(1 + LUMI_SCALE L).
 LUMI_SCALE: Final = 8.0
-#: The light that is encoded as 1 in pictures of Lumi maps that are shown to qwen.
+#: The light that is encoded as 1 in the pictures of Lumi maps for qwen.
 LUMI_PEAK: Final = 4.0
 #: Scale of the data variable of relighting: RELIT_SCALE (relit - photo).
 RELIT_SCALE: Final = 4.0
@@ -88,7 +88,10 @@ def unpack_patches(tokens: Array, size: tuple[int, int], patch: int) -> Array:
 
 
 def decode_small(encoded: Array) -> Array:
-    """Return a small sRGB picture in linear light, on the host: a device would have to compile for it."""
+    """Return a small sRGB picture in linear light.
+
+    It is computed on the host, because a device would compile for it.
+    """
     return srgb_to_linear(encoded).astype(np.float32)
 
 

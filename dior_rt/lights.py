@@ -1,4 +1,4 @@
-"""Lights as layers: compose the light that is asked for from the light on the photo and what a person drew.
+"""Lights as layers: compose the requested light from the light on the photo and the user's drawing.
 
 A layer acts on the light T below it; at the bottom T is S, the source Lumi map. With the drawn light D, times
 the layer's strength and tint, and the coverage m in 0..1:
@@ -32,7 +32,8 @@ from dior_rt.reach import check_reach, closeness
 Blend = Literal["set", "add", "multiply"]
 BLENDS: Final[tuple[Blend, ...]] = get_args(Blend)
 
-#: A cell that a layer covers less than this is left to the model: the faint rim of a soft brush asks nothing.
+#: A cell with less coverage than this is left to the model, so that the faint rim of a soft brush sets no
+#: light.
 LEAST_COVERAGE: Final = 1 / 16
 
 
@@ -41,9 +42,9 @@ class Light:
     """One layer of light.
 
     drawn: the light D, linear RGB, and the coverage m as its mask, of the photo's shape and any size; or
-    strokes in pixels of the photo. strength, tint: multiply D, >= 0. reach: how far from the layer light
-    changes, in longer sides of the photo; None: as far as the model takes it. on: whether the layer counts.
-    name: for people.
+    strokes in pixels of the photo. strength, tint: factors of D, >= 0. reach: how far from the layer light
+    changes, in longer sides of the photo; None leaves it to the model. on: whether the layer counts. name: a
+    name for people.
     """
 
     drawn: Strokes | tuple[Stroke, ...]
@@ -66,7 +67,10 @@ class Light:
 
 @dataclass(frozen=True)
 class Cover:
-    """A layer on the light grid. amount: each cell's mean of m D, (h, w, 3); coverage: of m, (h, w)."""
+    """A layer on the light grid.
+
+    amount: each cell's mean of m D, (h, w, 3); coverage: the mean of m, (h, w).
+    """
 
     amount: Array
     coverage: Array
@@ -74,15 +78,21 @@ class Cover:
 
 @dataclass(frozen=True)
 class Composed:
-    """What the lights ask for. target: the light, and where. nearness: (h, w) in 0..1, how far each cell may
-    follow the model; None: all of them, all the way."""
+    """The light that the lights ask for.
+
+    target: the light, and its mask. nearness: (h, w) in 0..1, how far each cell may follow the model; None
+    lets all cells follow it fully.
+    """
 
     target: Strokes
     nearness: Array | None
 
 
 def convert_lights(lights: Sequence[Light], matrix: Matrix | None) -> list[Light]:
-    """Lights in other primaries, by a matrix of `primaries.conversion`; their tint becomes part of D."""
+    """Return the lights in other primaries, by a matrix of `primaries.conversion`.
+
+    Their tint becomes part of D.
+    """
     return list(lights) if matrix is None else [_convert(light, matrix) for light in lights]
 
 
@@ -100,9 +110,9 @@ def _convert(light: Light, matrix: Matrix) -> Light:
 
 
 def cover(drawn: Strokes, grid: tuple[int, int]) -> Cover:
-    """The mean of m D and of m over the exact area of each cell of the grid."""
+    """Return the mean of m D and of m over the exact area of each cell of the grid."""
     down, across = (area_weights(size, cells) for size, cells in zip(drawn.mask.shape, grid, strict=True))
-    light = np.where(drawn.mask[..., None] > 0, drawn.light, 0)  # what is not drawn may hold anything
+    light = np.where(drawn.mask[..., None] > 0, drawn.light, 0)  # pixels without drawing may hold any value
     planes = np.concatenate([light * drawn.mask[..., None], drawn.mask[..., None]], axis=-1, dtype=np.float32)
     rows, columns = drawn.mask.shape
     narrow = across @ (down @ planes.reshape(rows, columns * 4)).reshape(grid[0], columns, 4)
@@ -112,7 +122,7 @@ def cover(drawn: Strokes, grid: tuple[int, int]) -> Cover:
 def compose(
     source: Array, lights: Sequence[Light], covers: Sequence[Cover], matrix: Matrix | None = None
 ) -> Composed:
-    """Compose what the lights that are on ask for, the first at the bottom. source: the Lumi map (h, w, 3).
+    """Compose the light of all lights that are on, the first at the bottom. source: the Lumi map (h, w, 3).
 
     covers: the lights on the grid of the source, one for each. matrix: from the lights' primaries to those of
     the source, see `primaries.conversion`.
@@ -135,7 +145,7 @@ def compose(
 
 
 def blend(below: Array, light: Light, layer: Cover, matrix: Matrix | None = None) -> Array:
-    """The light after one layer, by the equations above; matrix: as `compose` takes it."""
+    """Return the light after one layer, by the equations above. matrix: as `compose` takes it."""
     amount = layer.amount * np.float32(light.strength) * np.asarray(light.tint, np.float32)
     amount = convert(amount, matrix)
     if light.blend == "add":

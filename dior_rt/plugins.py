@@ -1,4 +1,4 @@
-"""Execution providers that come as packages of their own and plug into ONNX Runtime (from 1.24.4 on)."""
+"""Execution providers in separate packages that plug into ONNX Runtime (from 1.24.4 on)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,19 @@ from typing import Any
 
 import onnxruntime as ort
 
-#: The package that brings a provider, by the provider's name on the command line.
+#: The package of each provider, by the provider's name on the command line.
 PACKAGES = {"webgpu": "onnxruntime_ep_webgpu", "openvino": "onnxruntime_ep_openvino"}
 
 _lock = threading.Lock()
 
 
 def plugin_devices(name: str, choice: str = "") -> list[Any]:
-    """ONNX Runtime's devices of a plug-in; choice: "CPU", "GPU" or "NPU", or the number of one of them.
+    """Return ONNX Runtime's devices of a plug-in.
 
-    Empty where the package is not installed, does not fit this ONNX Runtime, or finds no such hardware.
+    choice: "CPU", "GPU" or "NPU", or the number of one of them.
+
+    The result is empty where the package is not installed, does not fit this ONNX Runtime, or finds no such
+    hardware.
     """
     devices = _registered(name)
     if choice.isdecimal():
@@ -28,7 +31,7 @@ def plugin_devices(name: str, choice: str = "") -> list[Any]:
 
 
 def is_installed(name: str) -> bool:
-    """Whether the package of a plug-in is there, whatever hardware it finds."""
+    """Return whether the package of a plug-in is installed, whatever hardware it finds."""
     return name in PACKAGES and find_spec(PACKAGES[name]) is not None
 
 
@@ -46,5 +49,5 @@ def _register(name: str) -> list[Any]:
         plugin = import_module(package)
         ort.register_execution_provider_library(package, plugin.get_library_path())
         return [device for device in ort.get_ep_devices() if device.ep_name == plugin.get_ep_name()]
-    except Exception:  # a library that cannot be loaded here is as good as none
+    except Exception:  # a library that cannot be loaded here counts as missing
         return []

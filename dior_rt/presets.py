@@ -1,8 +1,8 @@
-"""The presets of a bundle: faster ways to sample, each of which promises an error.
+"""The presets of a bundle: faster ways to sample, each with a promised error.
 
-`reference` is the model's own way: all of its steps, by Euler's method, with guidance at every sigma. The
-other presets are data of the bundle, in presets.json. `python -m tools.presets` measures them with its
-model.
+`reference` is the model's default: all of its steps, by Euler's method, with guidance at every sigma. The
+other presets are data of the bundle, in presets.json. `python -m tools.presets` measures them with the
+bundle's model.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dior_rt.flow.solvers import SOLVERS
 from dior_rt.records import parse, read_json
 
 REFERENCE: Final = "reference"
-#: The presets of a bundle, and what they promise: PSNR in dB to the reference's picture.
+#: The presets of a bundle and their promises: PSNR in dB against the reference's picture.
 PROMISES: Final = {"balanced": 45.0, "fast": 40.0}
 PRESETS: Final = "presets.json"
 MOST_BYTES: Final = 1 << 16
@@ -29,7 +29,7 @@ ALWAYS: Final = (0.0, 1.0)
 
 @dataclass(frozen=True)
 class Preset:
-    """How to walk the flow, measured with one model. Raises ValueError."""
+    """How to sample the flow, measured with one model. Raises ValueError."""
 
     #: Number of solver steps.
     steps: int
@@ -52,7 +52,7 @@ class Preset:
 
 
 def read_presets(bundle: Bundle) -> dict[str, Preset]:
-    """The bundle's own presets by name; none where it has no presets.json. Raises BundleError."""
+    """Return the bundle's presets by name, or none where it has no presets.json. Raises BundleError."""
     if PRESETS not in bundle.manifest.files:
         return {}
     try:

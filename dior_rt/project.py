@@ -35,7 +35,10 @@ FARTHEST: Final = 1e6  # pixels
 
 @dataclass(frozen=True)
 class PhotoRef:
-    """The photo that was drawn on. size: [width, height]. sha256: of its file, or empty where unknown."""
+    """The photo that was drawn on.
+
+    size: [width, height]. sha256: the hash of its file, or empty where unknown.
+    """
 
     size: tuple[int, ...]
     name: str = ""
@@ -44,7 +47,7 @@ class PhotoRef:
 
 @dataclass(frozen=True)
 class Settings:
-    """How the lights are made into a picture: see `Relighter.relight`. None: the model's own."""
+    """The settings of the result, see `Relighter.relight`. None: the model's default."""
 
     preset: str | None = None
     steps: int | None = None
@@ -54,7 +57,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class ShapeRecord:
-    """A `Shape` with its `Paint`, as the file has it."""
+    """A `Shape` with its `Paint`, as the file stores it."""
 
     kind: Literal["stroke", "fill", "gradient", "glow"]
     points: tuple[tuple[float, ...], ...]
@@ -71,7 +74,7 @@ class ShapeRecord:
 
 @dataclass(frozen=True)
 class LightRecord:
-    """A layer, as the file has it: see `Light`. solo: where any layer is solo, only those count."""
+    """A layer, as the file stores it: see `Light`. solo: where any layer is solo, only solo layers count."""
 
     name: str = ""
     blend: Blend = "add"
@@ -85,7 +88,7 @@ class LightRecord:
 
 @dataclass(frozen=True)
 class Project:
-    """A project file. Two that are equal give the same picture."""
+    """A project file. Two equal ones give the same picture."""
 
     photo: PhotoRef
     lights: tuple[LightRecord, ...] = ()
@@ -95,7 +98,7 @@ class Project:
 
 
 def parse_project(document: Any) -> Project:
-    """A project from parsed JSON. Raises ValueError, naming the place."""
+    """Return a project from parsed JSON. Raises ValueError, which names the place."""
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise ValueError("it is not a project of the light desk")
     if document.get("version") != VERSION:
@@ -126,13 +129,13 @@ def read_project(path: Path) -> Project:
 
 
 def unpack(data: bytes) -> Project:
-    """A project from the bytes of its file. Raises ValueError."""
+    """Return a project from the bytes of its file. Raises ValueError."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive, archive.open(ENTRY) as entry:
             document = entry.read(MOST_BYTES + 1)
     except (zipfile.BadZipFile, KeyError, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise ValueError("it is damaged, or not a project of the light desk") from error
-    except Exception as error:  # zlib.error and its like, of other compressions
+    except Exception as error:  # zlib.error and the errors of other compressions
         raise ValueError("it is damaged") from error
     if len(document) > MOST_BYTES:
         raise ValueError(f"it holds more than {MOST_BYTES >> 20} MiB")
@@ -140,7 +143,7 @@ def unpack(data: bytes) -> Project:
 
 
 def pack(project: Project) -> bytes:
-    """The bytes of a project's file: the same for equal projects."""
+    """Return the bytes of a project's file. They are the same for equal projects."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         info = zipfile.ZipInfo(ENTRY, date_time=(1980, 1, 1, 0, 0, 0))
@@ -156,15 +159,15 @@ def write_project(path: Path, project: Project) -> None:
 
 
 def hash_file(path: Path) -> str:
-    """The sha256 of a file's bytes, in hexadecimal."""
+    """Return the sha256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def lights_of(project: Project, size: tuple[int, int], painter: Painter | None = None) -> list[Light]:
-    """The lights that count, drawn for a photo of (rows, columns), the first at the bottom.
+    """Return the lights that count, drawn for a photo of (rows, columns), the first at the bottom.
 
-    Raises InputError where the photo's size is not the project's, or a layer makes no sense.
+    Raises InputError where the photo's size differs from the project's, or a layer makes no sense.
     """
     if tuple(project.photo.size) != size[::-1]:
         width, height = project.photo.size
@@ -204,7 +207,7 @@ _FEWEST_POINTS: Final = {"stroke": 1, "fill": 1, "gradient": 2, "glow": 3}
 
 
 def _problem(shape: ShapeRecord) -> str | None:
-    """What is wrong with a shape, or None."""
+    """Return what is wrong with a shape, or None."""
     if len(shape.points) < _FEWEST_POINTS[shape.kind]:
         return f"a {shape.kind} needs at least {_FEWEST_POINTS[shape.kind]} points"
     if not all(len(point) == 2 and max(map(abs, point)) <= FARTHEST for point in shape.points):

@@ -1,7 +1,7 @@
-"""The devices of ONNX Runtime: their names here, how to open a session on one, and what its errors become.
+"""The devices of ONNX Runtime: their names, how to open a session on one, and the translation of its errors.
 
 A device is named as on the command line: "cpu", "cuda", "cuda:1", "openvino:GPU". No graph ever moves to
-another device in silence.
+another device without notice.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dior_rt.errors import BundleError, DeviceError, InputError
 from dior_rt.files import reason
 from dior_rt.plugins import plugin_devices
 
-with contextlib.suppress(Exception):  # the builds for Windows, which report to the system itself
+with contextlib.suppress(Exception):  # the Windows builds, which report to the operating system
     ort.disable_telemetry_events()
 
 _ORT_ERRORS: tuple[type[Exception], ...] = (
@@ -34,8 +34,9 @@ _ORT_ERRORS: tuple[type[Exception], ...] = (
 class Provider:
     """An execution provider of ONNX Runtime.
 
-    ort_name: its name there. options: what keeps it in float32. choice: the option that picks one of its
-    devices. accelerator: the device that "auto" tries, where the provider's own default may be the CPU.
+    ort_name: its name in ONNX Runtime. options: those that keep it in float32. choice: the option that picks
+    one of its devices. accelerator: the device that "auto" tries, where the provider's default may be the
+    CPU.
     """
 
     ort_name: str
@@ -57,7 +58,7 @@ PROVIDERS = {
 
 
 def available() -> list[str]:
-    """The names of the providers that are built in or plugged in and find hardware; "cpu" is the last."""
+    """Return the names of the built-in or plugged-in providers that find hardware. "cpu" is the last."""
     built = ort.get_available_providers()
     return [
         name for name, provider in PROVIDERS.items() if provider.ort_name in built or plugin_devices(name)
@@ -65,7 +66,7 @@ def available() -> list[str]:
 
 
 def accelerators() -> list[str]:
-    """The devices that "auto" tries before the CPU, best first."""
+    """Return the devices that "auto" tries before the CPU, best first."""
     choices = {name: PROVIDERS[name].accelerator for name in available() if name != "cpu"}
     return [
         f"{name}:{choice}" if choice else name
@@ -75,18 +76,19 @@ def accelerators() -> list[str]:
 
 
 def is_built_in(name: str) -> bool:
-    """Whether the installed ONNX Runtime was built with a provider; else it may be plugged in."""
+    """Return whether the installed ONNX Runtime was built with a provider. Others may be plugged in."""
     return PROVIDERS[name].ort_name in ort.get_available_providers()
 
 
 def open_session(model: Path, device: str, threads: int | None, keep: bool = True) -> ort.InferenceSession:
-    """Load a graph on a device, which takes all of it but the operations that it lacks; the CPU takes those.
+    """Load a graph on a device. The CPU runs the operations that the device lacks.
 
-    threads: CPU threads for one operation; None leaves it to ONNX Runtime. keep: memory and threads for the
-    next run, which is faster; of graphs that take turns each would keep as much from the others.
+    threads: CPU threads for one operation; None leaves the number to ONNX Runtime. keep: whether to keep
+    memory and threads for the next run, which is faster. Graphs that take turns should not keep them, because
+    each would withhold them from the others.
 
-    Raises DeviceError for a device that is not there or cannot be started, BundleError for a file that is no
-    ONNX graph, and InputError for threads below 1.
+    Raises DeviceError for a device that does not exist or cannot be started, BundleError for a file that is
+    not an ONNX graph, and InputError for threads below 1.
     """
     name, _, choice = device.partition(":")
     if name not in available() or (choice and not PROVIDERS[name].choice):
@@ -104,7 +106,7 @@ def open_session(model: Path, device: str, threads: int | None, keep: bool = Tru
     try:
         session = _start(model, providers, session_options)
     except _ORT_ERRORS as error:
-        # What the CPU cannot load is no graph; an accelerator may have reasons of its own.
+        # A file that the CPU cannot load is not a graph. An accelerator may fail for other reasons.
         kind = BundleError if name == "cpu" else DeviceError
         raise kind(f"{device} cannot load {model}: {reason(error)}.") from error
     if session.get_providers()[0] != provider.ort_name:
@@ -114,7 +116,7 @@ def open_session(model: Path, device: str, threads: int | None, keep: bool = Tru
 
 @contextlib.contextmanager
 def translated(device: str) -> Iterator[None]:
-    """ONNX Runtime's errors as DeviceError."""
+    """Raise ONNX Runtime's errors as DeviceError."""
     try:
         yield
     except _ORT_ERRORS as error:
@@ -124,21 +126,23 @@ def translated(device: str) -> Iterator[None]:
 def _session_options(name: str, threads: int | None, keep: bool) -> ort.SessionOptions:
     options = ort.SessionOptions()
     options.enable_cpu_mem_arena = keep
-    if not keep:  # threads that wait for their next work hold a core
+    if not keep:  # threads that spin for their next work occupy a core
         options.add_session_config_entry("session.force_spinning_stop", "1")
     options.log_severity_level = 3
     if threads is not None:
         if threads < 1:
             raise InputError(f"threads must be at least 1, not {threads}.")
         options.intra_op_num_threads = threads
-    if name == "dml":  # DirectML's provider demands both
+    if name == "dml":  # DirectML's provider requires both
         options.enable_mem_pattern = False
         options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     return options
 
 
 def _readable(model: Path) -> str | bytes:
-    """The path as ONNX Runtime takes it: as text, or the file's content where the path is no text."""
+    """Return the path as ONNX Runtime takes it: as text, or the file's content where the path is not valid
+    text.
+    """
     try:
         str(model).encode()
     except UnicodeEncodeError:
@@ -151,7 +155,7 @@ def _start(
 ) -> ort.InferenceSession:
     ort.set_default_logger_severity(
         4
-    )  # what fails is raised or seen by the caller; no log on the terminal too
+    )  # failures are raised or seen by the caller, so the terminal needs no log
     try:
         return ort.InferenceSession(
             _readable(model), options, providers=list(providers.items()) or None, enable_fallback=0

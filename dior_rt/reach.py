@@ -1,4 +1,4 @@
-"""How far light carries from the strokes: within their reach it is the model's, beyond it the photo's."""
+"""How far light carries from the strokes: the model's light within their reach, the photo's beyond it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LEAST: Final = 1e-3  # of the picture's longer side: finer than any light grid
 
 
 def check_reach(reach: float | None) -> None:
-    """Raises InputError for a reach that is no number of at least LEAST."""
+    """Raise InputError for a reach that is not a number of at least LEAST."""
     if reach is not None and not (math.isfinite(reach) and reach >= LEAST):
         raise InputError(f"reach must be a number of at least {LEAST:g}, not {reach}.")
 
@@ -35,10 +35,11 @@ def fade(source: Array, relit: Array, nearness: Array) -> Array:
 
 
 def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:
-    """exp(-(d / reach)^2), (h, w), where d is a cell's distance to the nearest that is drawn, in longer sides
-    of the picture: 1 where drawn, 0.37 at the reach, 0 where nothing is drawn at all.
+    """Return exp(-(d / reach)^2), (h, w), where d is a cell's distance to the nearest drawn cell.
 
-    The nearest has the greatest value, and a product's greatest is found along the rows, then down.
+    d is in longer sides of the picture. The value is 1 where drawn, 0.37 at the reach, and 0 where nothing is
+    drawn at all. The nearest drawn cell gives the greatest value, and the greatest product is found along the
+    rows, then down the columns.
     """
     down, along = (_fall(size, reach * max(drawn.shape)) for size in drawn.shape)
     nearest = np.stack([(along * row).max(axis=1) for row in drawn])
@@ -46,6 +47,6 @@ def closeness(drawn: NDArray[np.bool_], reach: float) -> Array:
 
 
 def _fall(size: int, reach: float) -> Array:
-    """(size, size): exp(-(d / reach)^2) between all cells of a line."""
+    """Return (size, size): exp(-(d / reach)^2) between all cells of a line."""
     place = np.arange(size)
     return np.exp(-(((place[:, None] - place) / reach) ** 2)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""JSON to frozen dataclasses and back, strictly: what is unknown, missing or of another type is refused."""
+"""Convert JSON to frozen dataclasses and back, strictly: unknown, missing or mistyped values are refused."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ T = TypeVar("T")
 
 
 def read_json(path: Path, most_bytes: int) -> Any:
-    """The JSON document at `path`; ValueError for one that is too long, too deep, or no JSON by the standard.
+    """Return the JSON document at `path`.
 
-    Keys that occur twice and the numbers NaN and Infinity are refused: two readers could disagree about them.
-    Raises OSError where the file cannot be read.
+    Raises ValueError for one that is too long, too deep, or not standard JSON.
+
+    Keys that occur twice and the numbers NaN and Infinity are refused, because two readers could disagree
+    about them. Raises OSError where the file cannot be read.
     """
     with path.open("rb") as file:
         data = file.read(most_bytes + 1)
@@ -27,9 +29,10 @@ def read_json(path: Path, most_bytes: int) -> Any:
 
 
 def loads(data: bytes) -> Any:
-    """The JSON document in `data`, as strictly as `read_json`. Raises ValueError."""
+    """Return the JSON document in `data`, as strictly as `read_json`. Raises ValueError."""
     try:
-        # Windows' shells write UTF-16, or UTF-8 with a mark; the standard lets a reader take both.
+        # Windows' shells write UTF-16, or UTF-8 with a byte order mark. The standard lets a reader accept
+        # both.
         text = data.decode(json.detect_encoding(data))
         return json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant)
     except RecursionError:
@@ -39,7 +42,7 @@ def loads(data: bytes) -> Any:
 def parse(kind: type[T], value: Any, where: str = "") -> T:
     """Build a `kind` (a type annotation: a dataclass, a container of them, a JSON scalar) from parsed JSON.
 
-    Dataclasses in a union are told apart by their field `kind`. Raises ValueError, naming the place.
+    Dataclasses in a union are distinguished by their field `kind`. Raises ValueError, which names the place.
     """
     origin, args = typing.get_origin(kind), typing.get_args(kind)
     if origin in (types.UnionType, typing.Union):
@@ -60,7 +63,7 @@ def parse(kind: type[T], value: Any, where: str = "") -> T:
 
 
 def unparse(record: Any) -> Any:
-    """The JSON form of a dataclass, ready for `json.dumps`: tuples become lists."""
+    """Return the JSON form of a dataclass, ready for `json.dumps`. Tuples become lists."""
     return dataclasses.asdict(record)
 
 
@@ -75,7 +78,7 @@ def _parse_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
     if isinstance(value, dict) and kinds:
         return parse(kinds[0], value, where)
     for option in options:
-        # The exact type first: 1 is an int before it is a float, and True is no int.
+        # The exact type comes first: 1 is an int before it is a float, and True is not an int.
         if type(value) is option:
             return parse(option, value, where)
     if type(value) is int and float in options:

@@ -1,4 +1,4 @@
-"""Relight a photo: the way of a picture from pixels to pixels."""
+"""Relight a photo: the steps from the pixels of the photo to those of the result."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ from dior_rt.sampling import DEFAULTS, Sampling, SamplingFields, SamplingOptions
 from dior_rt.stopwatch import Stopwatch
 
 Progress = Callable[[int, int], bool | None]
-#: What a person can draw: light and mask, strokes as lines, an RGBA picture, or layers.
+#: The ways to draw light: light and mask, strokes as lines, an RGBA picture, or layers.
 Drawing = Strokes | Sequence[Stroke] | Picture | Sequence[Light]
 
 MOST_COVERS = 64  # layers whose light grids an open photo keeps
 
-MOST_SIZES = 4  # sizes of its previews at which an open photo is kept
+MOST_SIZES = 4  # preview sizes at which an open photo is kept
 
-CANVAS = 2048  # pixels of the longest side on which strokes given as lines are drawn
+CANVAS = 2048  # pixels of the longest side on which strokes passed as lines are drawn
 
 NOTHING_DRAWN = "The strokes specify nothing, so the photo is unchanged."
 
 
 @contextmanager
 def _device_errors() -> Iterator[None]:
-    """Turn what the kernels say of a device, at any moment, into DeviceError; it decorates as well."""
+    """Turn the kernels' device errors, whenever they occur, into DeviceError. It is also a decorator."""
     try:
         yield
     except KernelError as error:
@@ -67,11 +67,10 @@ def _device_errors() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Relit:
-    """A relit photo and how it came about.
+    """A relit photo and the settings that made it.
 
-    picture: of the photo's kind, dtype and size. notice: what the person should know, or None.
-    seconds: by stage (kernels, steps, transfer). steps: as many as were taken. sampling, seed, intensity,
-    reach: as used.
+    picture: of the photo's kind, dtype and size. notice: a sentence for the user, or None. seconds: by stage
+    (kernels, steps, transfer). steps: the number of steps taken. sampling, seed, intensity, reach: as used.
     """
 
     picture: Picture
@@ -85,11 +84,11 @@ class Relit:
 
     @property
     def guidance(self) -> float:
-        """The scale that was used."""
+        """Return the scale that was used."""
         return self.sampling.guidance
 
     def facts(self) -> dict[str, Any]:
-        """What decided the result, for its metadata."""
+        """Return the settings that decided the result, for its metadata."""
         used = {"steps": self.steps, "seed": self.seed, "intensity": self.intensity, "reach": self.reach}
         return {**self.sampling.facts(), **used}
 
@@ -127,12 +126,15 @@ class Relighter:
 
     @property
     def bundle(self) -> Bundle:
-        """The bundle that was loaded."""
+        """Return the bundle that was loaded."""
         return self._bundle
 
     @property
     def ops(self) -> str:
-        """What runs the pixel kernels. Under "auto" NumPy takes over from a device that computes wrongly."""
+        """Return what runs the pixel kernels.
+
+        Under "auto" NumPy replaces a device that computes wrong results.
+        """
         return self._ops.name
 
     @property
@@ -141,16 +143,19 @@ class Relighter:
 
     @property
     def ops_notice(self) -> str:
-        """What the user should know of that choice, such as a driver that crashes; "" for nothing."""
+        """Return a notice about that choice for the user, such as a driver that crashes, or "" for none."""
         return self._ops.notice
 
     @property
     def presets(self) -> tuple[str, ...]:
-        """The names that `relight` takes as its preset. Raises BundleError."""
+        """Return the names that `relight` takes as its preset. Raises BundleError."""
         return REFERENCE, *read_presets(self.bundle)
 
     def facts(self) -> dict[str, Any]:
-        """What makes its results, for their metadata. The manifest's hash covers those of all files."""
+        """Return what determines its results, for their metadata.
+
+        The manifest's hash covers those of all files.
+        """
         return {
             "version": __version__,
             "bundle": self.bundle.manifest.name,
@@ -160,7 +165,7 @@ class Relighter:
         }
 
     def open(self, photo: Picture, primaries: Matrix | None = None) -> OpenPhoto:
-        """Prepare a photo to be relit many times: what depends on the photo alone is computed once.
+        """Prepare a photo to be relit many times. Whatever depends only on the photo is computed once.
 
         photo: as `relight` takes it. primaries: the photo's own, to which drawn light is converted; None:
         those of a Pillow image's profile, else sRGB's. Raises InputError.
@@ -248,7 +253,7 @@ class Relighter:
         if mask.shape != raster:
             check_same_shape(mask.shape, size)
         drawn = self._ops.reduce_strokes(light, mask, raster)
-        # In float64, which holds the product of any strokes and any intensity that is allowed.
+        # float64 holds the product of any allowed strokes and intensity.
         light = drawn.light.astype(np.float64) * intensity
         drawn = Strokes(light.clip(max=STRONGEST).astype(np.float32), drawn.mask)
         if not light.max() <= STRONGEST:
@@ -256,7 +261,7 @@ class Relighter:
         return drawn
 
     def _draw(self, strokes: Sequence[Stroke], size: tuple[int, int]) -> Strokes:
-        # Far finer than any light grid, and bounded, however large the photo.
+        # The raster is far finer than any light grid, and bounded, however large the photo is.
         scale = min(1.0, CANVAS / max(size))
         canvas = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
         down, across = canvas[0] / size[0], canvas[1] / size[1]
@@ -273,7 +278,7 @@ class Relighter:
     def _sample(
         self, condition: Any, how: Sampling, seed: int, progress: Progress | None
     ) -> tuple[Array, int]:
-        """The state at the end of the flow, and how many steps led there."""
+        """Return the state at the end of the flow, and the number of steps that were taken."""
         noise = draw_noise(seed, self._family.noise_shape(condition))
         noise *= np.float32(how.noise_scale)
         taken = 0
@@ -287,11 +292,12 @@ class Relighter:
         if how.tolerance is None:
             sigmas = self._sigmas(condition, how.steps, how.shift)
             return sample(self._velocity(condition, sigmas, how), noise, sigmas, how.solver)
-        # The reference's own stops: a finer schedule ends nearer the image, and that is another answer.
+        # The search uses the reference's sigmas. A finer schedule ends nearer the image, and so gives
+        # another answer.
         family, sigmas = self._family, self._sigmas(condition, self.bundle.manifest.steps, how.shift)
 
         def distance(one: Array, other: Array) -> float:
-            """RMS of the light grid's pictures, sRGB-encoded 0..1."""
+            """Return the RMS of the light grid's pictures, sRGB-encoded 0..1."""
             pictures = (family.decode_relit(x0, condition).astype(np.float64) for x0 in (one, other))
             return float(np.sqrt(np.mean(np.subtract(*pictures) ** 2)))
 
@@ -359,10 +365,11 @@ class OpenPhoto:
         reach: float | None = None,
         progress: Progress | None = None,
     ) -> Relit:
-        """The photo under the lights, fast: at most `longest` pixels a side, by the model's fast preset.
+        """Return the photo under the lights, fast: at most `longest` pixels per side, by the model's fast
+        preset.
 
-        The light is that of `relight` with as many steps: the light grid is the full photo's. The picture is
-        uint8, (rows, columns, 3).
+        The light is that of `relight` with as many steps, because the light grid is that of the full photo.
+        The picture is uint8, (rows, columns, 3).
         """
         if longest < 1:
             raise InputError(f"A preview must have at least 1 pixel a side, not {longest}.")
@@ -371,7 +378,7 @@ class OpenPhoto:
         return self._relight(small, small, lights, how, seed, intensity, reach, progress)
 
     def small(self, longest: int) -> NDArray[np.uint8]:
-        """The photo itself at the size of a preview: uint8, (rows, columns, 3)."""
+        """Return the photo itself at the size of a preview: uint8, (rows, columns, 3)."""
         scale = min(1.0, longest / max(self.size))
         height, width = (max(1, round(side * scale)) for side in self.size)
         with self._lock:
@@ -386,12 +393,14 @@ class OpenPhoto:
 
     @_device_errors()
     def source_map(self) -> Array:
-        """The light on the photo, by the model: a Lumi map (h, w, 3), linear >= 0, of the light grid."""
+        """Return the model's estimate of the light on the photo: a Lumi map (h, w, 3), linear >= 0, of the
+        light grid.
+        """
         return self._source_map.copy()
 
     @_device_errors()
     def target_map(self, lights: Sequence[Light], *, intensity: float = 1.0) -> Strokes:
-        """What the lights ask for, composed with the source map, on the light grid."""
+        """Return the light that the lights ask for, composed with the source map, on the light grid."""
         return self._compose(lights, intensity).target
 
     @cached_property
@@ -451,13 +460,16 @@ class OpenPhoto:
     def _compose(self, lights: Sequence[Light], intensity: float) -> Composed:
         lights = [replace(one, strength=one.strength * intensity) for one in lights if one.on]
         covers = [self._cover(light.drawn) for light in lights]
-        if not any(layer.coverage.any() for layer in covers):  # the source map is for those who need it
+        if not any(layer.coverage.any() for layer in covers):  # the source map is computed only on demand
             nothing = np.zeros((*self._raster, 3), np.float32)
             return Composed(Strokes(nothing, nothing[..., 0]), None)
         return compose(self._source_map, lights, covers, conversion(srgb(), self._primaries))
 
     def _cover(self, drawn: Strokes | tuple[Stroke, ...]) -> Cover:
-        """The layer on the light grid; kept, for most layers stay as they are while one is drawn."""
+        """Return the layer on the light grid.
+
+        It is cached, because most layers stay unchanged while one is drawn.
+        """
         with self._lock:
             for source, layer in self._covers:
                 if source is drawn:
@@ -473,7 +485,7 @@ class OpenPhoto:
 
 
 def _are_layers(lights: Drawing) -> TypeGuard[Sequence[Light]]:
-    """Tell layers from the other ways to draw. Raises InputError for a mixture."""
+    """Return whether the strokes are layers. Raises InputError for a mixture."""
     if not isinstance(lights, Sequence):
         return False
     layers = [isinstance(one, Light) for one in lights]

@@ -1,4 +1,4 @@
-"""How the flow is sampled: what the caller may ask for, and what that resolves to for one bundle."""
+"""How the flow is sampled: the caller's options, and the settings that result from them for one bundle."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dior_rt.errors import InputError
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.presets import REFERENCE, Preset, read_presets
 
-#: The largest guidance and noise scale: far beyond any use, and float32 still holds what the network makes
-#: of it.
+#: The largest guidance and noise scale: far beyond any use, and still small enough for the network's results
+#: in float32.
 MOST_SCALE: Final = 1000.0
 
 
@@ -37,9 +37,9 @@ class SamplingOptions:
     noise_scale: float | None = None
 
     def override(self, **fields: Any) -> SamplingOptions:
-        """Return a copy in which every field that is given and not None replaces this one's.
+        """Return a copy in which every passed field that is not None replaces this one's.
 
-        Raises TypeError for a name that is no field.
+        Raises TypeError for a name that is not a field.
         """
         changes = SamplingOptions(**fields)
         return replace(self, **{name: value for name, value in vars(changes).items() if value is not None})
@@ -63,7 +63,7 @@ class SamplingFields(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Sampling(Preset):
-    """SamplingOptions resolved for one bundle: nothing is left open. Raises ValueError.
+    """SamplingOptions resolved for one bundle: no field is left open. Raises ValueError.
 
     Where `tolerance` is not None, `steps` and `solver` are not used.
     """
@@ -123,7 +123,7 @@ def resolve_sampling(bundle: Bundle, options: SamplingOptions = DEFAULTS) -> Sam
 
 
 def _find_preset(bundle: Bundle, name: str) -> Preset:
-    """Return a preset by name; the reference is the model's own number of steps."""
+    """Return a preset by name. The reference is the model's own number of steps."""
     if name == REFERENCE:
         return Preset(bundle.manifest.steps)
     presets = read_presets(bundle)

@@ -1,1 +1,1 @@
-"""Renders, triplets, networks, LoRA and evaluation. Imported as ``dior_rt.training``; needs the extra."""
+"""Renders, triplets, networks, LoRA and evaluation. Import it as ``dior_rt.training``; it needs the extra."""

@@ -1,4 +1,4 @@
-"""What training knows of a model, whichever it is; and mini with a LoRA on it."""
+"""The interface of a model in training, and its implementation by mini with a LoRA."""
 
 from __future__ import annotations
 
@@ -21,23 +21,25 @@ class Backbone(Protocol):
 
     @property
     def network(self) -> nn.Module:
-        """Called with x, sigma, photo, light, mask and mode, it gives the velocity of x."""
+        """Return the function that maps x, sigma, photo, light, mask and mode to the velocity of x."""
 
     def prepare(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """A batch of triplets (see `triplets.example`), its x0 and inputs made the network's own."""
+        """Convert a batch of triplets (see `triplets.example`), its x0 and inputs to the network's
+        variables.
+        """
 
     def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
-        """x0 of estimate mode -> the Lumi maps that it means, (B, 3, h, w) of the grid, linear >= 0."""
+        """Return the Lumi maps for an x0 of estimate mode, (B, 3, h, w) of the grid, linear >= 0."""
 
     def save(self, network: nn.Module) -> None:
-        """Write the network as it is exported later; it holds the weights' average then."""
+        """Write the network as it is exported later. It then holds the weights' average."""
 
 
 class MiniLora:
     """The network at `base` with a LoRA; the folder `out` receives the base's weights and `lora/`."""
 
     def __init__(self, base: Path, rank: int, out: Path) -> None:
-        """Raises InputError for a base that is no checkpoint of mini."""
+        """Load the network. Raises InputError for a base that is not a checkpoint of mini."""
         self.base, self.out = base, out
         lora = LoraConfig(r=rank, lora_alpha=rank, target_modules=LORA_TARGETS)
         self.network: nn.Module = get_peft_model(load_network(base), lora)  # type: ignore[arg-type]
@@ -55,7 +57,7 @@ class MiniLora:
 
 
 def resample(light: Tensor, grid: tuple[int, int]) -> Tensor:
-    """(B, 3, h, w) >= 0 to another grid, each cell the mean of what it covers."""
+    """Resample (B, 3, h, w) >= 0 to another grid, where each cell is the mean of the area that it covers."""
     if light.shape[2:] == torch.Size(grid):
         return light
     return F.interpolate(light.float(), grid, mode="bilinear", antialias=True).clamp_min(0)

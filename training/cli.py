@@ -25,7 +25,7 @@ Side = Annotated[int, typer.Option(min=32, help="Qwen: pixels a side of a square
 
 @app.callback()
 def _group() -> None:
-    """A callback keeps this a group of commands, however few they are."""
+    """Keep this a group of commands, even with a single command. Typer needs a callback for that."""
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -309,7 +309,7 @@ def evaluate(
     names = parse_judges(judges) if judges is not None else ()
     examples: list[Example] = []
     if out:
-        make_folder(out)  # now, rather than after the work
+        make_folder(out)  # checked now, rather than after the work
     if names:
         evaluation = judge(method, benchmark, names, settings, views)
     else:
@@ -395,7 +395,7 @@ def recipes(
 
 
 class _Bar:
-    """A progress bar on a terminal; elsewhere a line every hundred steps."""
+    """A progress bar on a terminal. Elsewhere it prints a line every hundred steps."""
 
     def __init__(self, steps: int) -> None:
         self.steps, self.began = steps, time.monotonic()

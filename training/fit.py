@@ -1,9 +1,9 @@
-"""The training loop: stage 1 from nothing, or a LoRA on top of it. One loop, whatever is being trained.
+"""The training loop for stage 1 from scratch, or for a LoRA on top of it. All backbones share one loop.
 
-Loss: the squared error of x0, which for relighting is the squared error of the relit sRGB picture (times 16)
-and for estimation that of the encoded Lumi map. What mini takes for the photo's own light is compared with
-the truth in every sample, since what is drawn is measured against it. Most of the samples are drawn at
-sigma = 1, where the whole answer has to come from the condition; the others at sigmas shifted towards it.
+The loss is the squared error of x0, which for relighting is the squared error of the relit sRGB picture
+(times 16) and for estimation that of the encoded Lumi map. In every sample, mini's estimate of the photo's
+own light is compared with the truth, because drawn light is measured against it. Most samples are drawn at
+sigma = 1, where the whole answer must come from the condition; the others at sigmas shifted towards it.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from dior_rt.training.light import FLOOR, RELIT_SCALE, log_floored, srgb_to_line
 from dior_rt.training.network import BOUNCED, WEIGHTS, Config, Mini, load_network, save_network
 from dior_rt.training.state import Average, State
 
-STOPS: Final = 2.0  # by which drawn light is strengthened or dimmed to see what it does
-LEAST_SIGMA: Final = 0.02  # smallest flow time that is drawn
-STATE: Final = "state.safetensors"  # what a run resumes from
+STOPS: Final = 2.0  # drawn light is scaled by this factor to measure the response
+LEAST_SIGMA: Final = 0.02  # smallest flow time that is sampled
+STATE: Final = "state.safetensors"  # the state from which a run resumes
 
 Progress = Callable[[int, float], None]  # step, running loss
 Batch = dict[str, Tensor]
@@ -41,19 +41,18 @@ Stream = Callable[[int, int], IterableDataset[Batch]]  # (number of the first ba
 
 @dataclass(frozen=True)
 class Plan:
-    """How to train.
+    """The options of training.
 
     The rate warms up, stays, and falls to 0 over the last fifth of the steps, so a longer plan can resume
-    from any state that came before the fall. average: the half-life of the weights' average, in steps.
-    clip: the largest norm of a gradient. shift, always_noise: of flow times, see `draw_sigma`. noiseless: the
-    share of samples whose noise is 0, as when sampling starts from the noise's mean. noise: how
-    strong it is in the others. source_weight: how the error of the source light counts beside that of x0.
-    drawn: how much more an error counts where something is drawn: there the light is known, and looked at.
-    edges: how the error's differences between neighbouring cells count beside the error: the outline of a
-    stroke that shows where the light goes on is small in error and large to the eye.
-    response: the weight of `response_loss`, taken of a quarter of a batch.
-    precision: as accelerate names it. compiled: by torch.compile, which takes minutes and then nearly
-    halves a step's time on CPUs. grids: see `Batches`.
+    from any state before the fall. average: the half-life of the weights' average, in steps. clip: the
+    largest norm of a gradient. shift, always_noise: parameters of flow times, see `draw_sigma`. noiseless:
+    the share of samples whose noise is 0, as when sampling starts from the noise's mean. noise: the strength
+    of the noise in the others. source_weight: the weight of the source light's error relative to that of x0.
+    drawn: the additional weight of errors under strokes, where the light is known and visible to the user.
+    edges: the weight of differences of the error between neighbouring cells. A visible outline where a stroke
+    ends is small in error but conspicuous. response: the weight of `response_loss`, computed on a quarter of
+    a batch. precision: a name of accelerate's. compiled: whether torch.compile is used, which takes minutes
+    and then nearly halves a step's time on CPUs. grids: see `Batches`.
     """
 
     steps: int
@@ -84,14 +83,14 @@ class Plan:
 
 
 def fit(renders: Path, out: Path, start: Config | Path, plan: Plan, progress: Progress | None = None) -> None:
-    """Train stage 1 on a folder of renders into the folder `out`; resumes where it holds a state.
+    """Train stage 1 on a folder of renders into the folder `out`. Resumes where it holds a state.
 
-    start: the sizes of a network that has learnt nothing, or the weights of one to go on from. Raises
-    InputError for renders, weights or a state that cannot be used, and where nothing can be written.
+    start: the sizes of an untrained network, or the weights of a network to continue from. Raises InputError
+    for renders, weights or a state that cannot be used, and where nothing can be written.
     """
     torch.manual_seed(plan.seed)
     network = Mini(start) if isinstance(start, Config) else load_network(start)
-    # Convolutions of channels that lie side by side take two thirds of a step's time on CPUs.
+    # With channels-last convolutions, a step takes two thirds of the time on CPUs.
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # in place
 
     def save(network: nn.Module) -> None:
@@ -104,7 +103,7 @@ def fit(renders: Path, out: Path, start: Config | Path, plan: Plan, progress: Pr
 def fit_lora(
     base: Path, renders: Path, out: Path, rank: int, plan: Plan, progress: Progress | None = None
 ) -> None:
-    """Train a LoRA on the network at `base`; the folder `out` receives the base's weights and `lora/`.
+    """Train a LoRA on the network at `base`. The folder `out` receives the base's weights and `lora/`.
 
     Resumes and raises like `fit`.
     """
@@ -114,7 +113,7 @@ def fit_lora(
 
 
 def rendered(renders: Path, plan: Plan) -> Stream:
-    """Triplets from a folder of renders; raises InputError where it holds none."""
+    """Return triplets from a folder of renders. Raises InputError where it holds none."""
     views = load_views(renders)
     return lambda start, rank: Batches(views, plan.batch, plan.seed, start, rank=rank, grids=plan.grids)
 
@@ -128,13 +127,15 @@ def flow_loss(
     drawn: float = 0.0,
     edges: float = 0.0,
 ) -> Tensor:
-    """Mean squared error of x0 at flow times sigma (B,); the network sees (1 - sigma) x0 + sigma noise.
+    """Return the mean squared error of x0 at flow times sigma (B,).
 
-    A batch may carry `weight` (B,), by which each sample's error counts, and `own`, the light on the photo as
-    estimation's x0 has it; the error of the network's idea of it counts `source_weight` times as much as
-    that of x0. Where the mask is, squared errors count `drawn` times more; a sample's weights are 1 in the
-    mean. The differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count `edges`
-    times.
+    The network sees (1 - sigma) x0 + sigma noise.
+
+    A batch may carry `weight` (B,), the weight of each sample's error, and `own`, the light on the photo in
+    the form of estimation's x0. The error of the network's estimate of it counts `source_weight` times as
+    much as that of x0. Under the mask, squared errors count `drawn` times more; the weights of a sample have
+    a mean of 1. The differences of x0's error between neighbouring cells, of pictures (B, C, h, w), count
+    `edges` times.
     """
     s = sigma[:, None, None, None]
     x0 = batch["x0"]
@@ -157,10 +158,11 @@ def flow_loss(
 
 
 def response_loss(network: nn.Module, batch: Batch, factor: Tensor) -> Tensor:
-    """How far mini's light under strokes is from following their value: drawn light times factor (B,) has to
-    be that much more light there, as far as the display shows it. The mean squared error of the logarithm.
+    """Return how far mini's light under strokes deviates from following their value.
 
-    The photo's own light does not depend on what is drawn: it is looked for once, and taken as it is.
+    Drawn light times factor (B,) must give that much more light there, as far as the display shows it. The
+    result is the mean squared error of the logarithm. The photo's own light does not depend on the strokes,
+    so it is estimated once and reused.
     """
     photo, light, mask = batch["photo"], batch["light"], batch["mask"]
     x, sigma, mode = torch.zeros_like(photo), torch.ones_like(factor), torch.zeros_like(batch["mode"])
@@ -175,7 +177,7 @@ def response_loss(network: nn.Module, batch: Batch, factor: Tensor) -> Tensor:
         before = lit(velocity)
     white = math.log1p(FLOOR)
     expected = before + torch.log((times * light + BOUNCED) / (light + BOUNCED))
-    counted = mask * (before < 0)  # of what is all but burnt out, nothing more can be said
+    counted = mask * (before < 0)  # cells that are nearly clipped carry no information
     error = lit(network(**inputs, light=times * light, own=source)) - expected.clamp(max=white)
     return (counted * error.square()).sum() / counted.sum().clamp_min(1)
 
@@ -185,14 +187,18 @@ def _mean_square(error: Tensor) -> Tensor:
 
 
 def draw_sigma(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
-    """(count,) flow times: 1 for a share of the samples, else u -> s u / (1 + (s - 1) u) of a uniform u."""
+    """Return (count,) flow times: 1 for a share of the samples, else u -> s u / (1 + (s - 1) u) of a uniform
+    u.
+    """
     u = torch.rand(count, generator=generator)
     shifted = shift_sigma(u, plan.shift).clamp_min(LEAST_SIGMA)
     return torch.where(torch.rand(count, generator=generator) < plan.always_noise, torch.ones(count), shifted)
 
 
 def draw_noise_strength(count: int, plan: Plan, generator: torch.Generator) -> Tensor:
-    """(count, 1, 1, 1): 0 for the share of samples without noise, and the noise's strength."""
+    """Return (count, 1, 1, 1): 0 for the share of samples without noise, and the noise's strength for the
+    others.
+    """
     noisy = torch.rand(count, generator=generator) >= plan.noiseless
     return plan.noise * noisy.float()[:, None, None, None]
 
@@ -206,10 +212,10 @@ def run(
     save: Callable[[nn.Module], None],
     prepare: Prepare = lambda batch: batch,
 ) -> None:
-    """Train to the plan's end; every so often `save` receives the network with its averaged weights.
+    """Train to the plan's end. At intervals, `save` receives the network with its averaged weights.
 
-    prepare: makes of a batch of triplets what the network's data variable is. Resumes where `out` holds a
-    state; raises InputError for one that cannot be used, and where nothing can be written.
+    prepare: converts a batch of triplets to the network's data variable. Resumes where `out` holds a state.
+    Raises InputError for a state that cannot be used, and where nothing can be written.
     """
     make_folder(out)
     accelerator = Accelerator(mixed_precision=plan.precision)
@@ -223,7 +229,7 @@ def run(
     if (out / STATE).exists():
         state.resume(out / STATE)
     batches = stream(state.step, accelerator.process_index)
-    # One process beside the training: several would each draw the same batches.
+    # One process runs beside the training. Several would each draw the same batches.
     loader = DataLoader(batches, batch_size=None, num_workers=1, prefetch_factor=4)
     running = math.nan
     for batch in islice(_with_plain_errors(loader), max(plan.steps - state.step, 0)):
@@ -241,7 +247,7 @@ def run(
 
 
 def _with_plain_errors(batches: Iterable[Batch]) -> Iterator[Batch]:
-    """The batches; what their process could not read is said without that process' traceback."""
+    """Yield the batches. Reading errors of their process are reported without that process' traceback."""
     try:
         yield from batches
     except InputError as error:
@@ -249,11 +255,11 @@ def _with_plain_errors(batches: Iterable[Batch]) -> Iterator[Batch]:
 
 
 def _step(accelerator: Accelerator, network: nn.Module, state: State, batch: Batch, plan: Plan) -> float:
-    """One step of the optimiser and of the average; returns the loss."""
+    """Run one step of the optimiser and of the average, and return the loss."""
     for group in state.optimizer.param_groups:
         group["lr"] = plan.rate_at(state.step)
     seed = hash((plan.seed, accelerator.process_index, state.step)) % 2**63
-    generator = torch.Generator().manual_seed(seed)  # the host's, so that a seed means the same everywhere
+    generator = torch.Generator().manual_seed(seed)  # on the host, so that a seed means the same everywhere
     sigma = draw_sigma(len(batch["x0"]), plan, generator).to(accelerator.device)
     noise = torch.randn(batch["x0"].shape, generator=generator).to(accelerator.device)
     noise *= draw_noise_strength(len(noise), plan, generator).to(accelerator.device)

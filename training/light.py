@@ -20,7 +20,10 @@ def srgb_to_linear(encoded: Tensor) -> Tensor:
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
-    """Return sRGB-encoded values (IEC 61966-2-1), for light in 0..1; the straight foot continues below 0."""
+    """Return sRGB-encoded values (IEC 61966-2-1) of light in 0..1.
+
+    The linear part near black continues below 0.
+    """
     return torch.where(
         linear <= 0.0031308,
         12.92 * linear,
@@ -44,8 +47,9 @@ def log_floored(light: Tensor) -> Tensor:
 
 
 def apply_log_ratio(light: Tensor, ratio: Tensor) -> Tensor:
-    """Return (L + e) exp(ratio) - e, with e = FLOOR; it may be slightly below 0, so that it stays
-    trainable.
+    """Return (L + e) exp(ratio) - e, with e = FLOOR.
+
+    It may be slightly below 0, so that it stays trainable.
     """
     return (light + FLOOR) * torch.exp(ratio) - FLOOR
 

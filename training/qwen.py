@@ -62,23 +62,26 @@ class Qwen(nn.Module):
             r=rank,
             lora_alpha=rank,
             target_modules=TARGETS,
-            # What the last block does to the words reaches no output.
+            # No output depends on what the last block does to the words.
             exclude_modules=[last + name for name in UNREAD],
             init_lora_weights="gaussian",
         )
         self.transformer.add_adapter(self.lora, adapter_name=ADAPTER)
-        cast_training_params(self.transformer)  # to float32, whatever the weights beneath are held in
+        cast_training_params(self.transformer)  # to float32, whatever the dtype of the weights beneath
         self.prompts = nn.ParameterDict({str(k): nn.Parameter(v, False) for k, v in prompts.items()})
 
     def forward(
         self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mask: Tensor, mode: Tensor
     ) -> Tensor:
-        """mask is in the light already, and not looked at."""
+        """Return the velocity. The mask is not used, because the light already contains it."""
         samples = zip(x, sigma, photo, light, mode.tolist(), strict=True)
         return torch.stack([self._one(*sample) for sample in samples])
 
     def _one(self, x: Tensor, sigma: Tensor, photo: Tensor, light: Tensor, mode: int) -> Tensor:
-        """One sample: the modes differ in the length of their prompts and the number of references."""
+        """Return the velocity of one sample.
+
+        The modes differ in the length of their prompts and the number of references.
+        """
         pictures = [x, photo, light] if mode == MODES["relight"] else [x, photo]
         rows, columns = x.shape[1:]
         tokens = torch.cat([pack_patches(picture) for picture in pictures])
@@ -92,7 +95,7 @@ class Qwen(nn.Module):
         return unpack_patches(velocity, (rows // 2, columns // 2))
 
     def load(self, path: Path) -> None:
-        """Take up a LoRA that `save` wrote. Raises InputError for any other."""
+        """Load a LoRA that `save` wrote. Raises InputError for any other."""
         try:
             weights = {key.removeprefix("transformer."): value for key, value in load_file(path).items()}
             wanted = get_peft_model_state_dict(self.transformer, adapter_name=ADAPTER)
@@ -113,7 +116,9 @@ class Qwen(nn.Module):
 
 
 class Pictures:
-    """An AutoencoderKLQwenImage: batches of triplets to batches of latents of some `area` pixels."""
+    """An AutoencoderKLQwenImage, which converts batches of triplets to batches of latents of `area`
+    pixels.
+    """
 
     def __init__(self, vae: Any, area: int) -> None:
         self.vae, self.area = vae.requires_grad_(False).eval(), area
@@ -123,24 +128,24 @@ class Pictures:
         )
 
     def prepare(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """photo, light, mask, mode and x0 of mini -> the same names, in latents."""
+        """Convert photo, light, mask, mode and x0 of mini to latents under the same names."""
         photo, mode = batch["photo"], batch["mode"][:, None, None, None]
         relit = photo + batch["x0"] / RELIT_SCALE
         lumi = draw_lumi(decode_lumi((batch["x0"] + 1) / 2))
         painted = torch.where(mode == MODES["relight"], relit, lumi)
         light = draw_lumi(batch["light"]) * (batch["mask"] > 0)
         latents = {"x0": painted, "photo": photo, "light": light}
-        # Of the photo's own light this network has no idea that could be compared.
+        # This network has no estimate of the photo's own light that could be compared.
         kept = {name: value for name, value in batch.items() if name != "own"}
         return {**kept, **{name: self.encode(picture) for name, picture in latents.items()}}
 
     def lumi(self, x0: Tensor, grid: tuple[int, int]) -> Tensor:
-        """Latents of drawn light -> the light on a grid, (B, 3, h, w), linear."""
+        """Return the light on a grid from latents of drawn light, (B, 3, h, w), linear."""
         return resample(undraw_lumi(self.decode(x0)), grid)
 
     @torch.no_grad()
     def encode(self, pictures: Tensor) -> Tensor:
-        """sRGB 0..1 (B, 3, h, w), resized to the area -> latents (B, z, h', w'), normalised."""
+        """Return the latents (B, z, h', w'), normalised, of sRGB 0..1 (B, 3, h, w), resized to the area."""
         size = fit_area(self.area, pictures.shape[2], pictures.shape[3], MULTIPLE)
         self.vae.to(pictures.device)
         with torch.autocast(pictures.device.type, enabled=False):
@@ -150,7 +155,7 @@ class Pictures:
 
     @torch.no_grad()
     def decode(self, latents: Tensor) -> Tensor:
-        """The inverse of `encode`, at the size of the area."""
+        """Return the picture of latents at the size of the area: the inverse of `encode`."""
         self.vae.to(latents.device)
         with torch.autocast(latents.device.type, enabled=False):
             z = latents.float() * self.std.to(latents.device) + self.mean.to(latents.device)
@@ -159,7 +164,7 @@ class Pictures:
 
 
 class QwenLora:
-    """The `Backbone`: a diffusers folder with a LoRA in training, which the folder `out` receives."""
+    """The `Backbone` of Qwen: a diffusers folder with a LoRA in training, which the folder `out` receives."""
 
     def __init__(
         self,
@@ -171,10 +176,12 @@ class QwenLora:
         start: Path | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        """prompts: mode -> embeddings (T, D); None takes those of the words that an export says. area: pixels
-        of the pictures. start: a LoRA that training goes on from. dtype: of the weights beneath the LoRA.
+        """Load the model. prompts: mode -> embeddings (T, D); None takes those of the export's prompts.
 
-        Raises InputError for a folder that is no such model, and for a LoRA that is none of `save`.
+        area: pixels of the pictures. start: a LoRA from which training continues. dtype: of the weights
+        beneath the LoRA.
+
+        Raises InputError for a folder that is not such a model, and for a LoRA that `save` did not write.
         """
         prompts = prompts or embed_prompts(folder)
         try:
@@ -209,7 +216,7 @@ def fit_qwen_lora(
     area: int = 512**2,
     progress: Progress | None = None,
 ) -> None:
-    """Train a LoRA on a diffusers folder of Qwen-Image-Edit; `out` receives it, and a state to resume from.
+    """Train a LoRA on a diffusers folder of Qwen-Image-Edit. `out` receives it, and a state to resume from.
 
     Arguments and errors are those of `QwenLora` and `fit`.
     """
@@ -220,18 +227,18 @@ def fit_qwen_lora(
 
 
 def dtype_of(plan: Plan) -> torch.dtype:
-    """Of the weights that are not trained."""
+    """Return the dtype of the weights that are not trained."""
     return torch.bfloat16 if plan.precision == "bf16" else torch.float32
 
 
 @torch.no_grad()
 def embed_prompts(folder: Path, prompts: dict[int, str] = DEFAULT_PROMPTS) -> dict[int, Tensor]:
-    """The embeddings (T, D) of each mode's prompt in the model's template, less its first words.
+    """Return the embeddings (T, D) of each mode's prompt in the model's template, without its first words.
 
     Raises InputError where the folder has no text encoder.
     """
     try:
-        if not (folder / "tokenizer").is_dir():  # transformers would take its name for one of the net's
+        if not (folder / "tokenizer").is_dir():  # or transformers would look for it online
             raise FileNotFoundError(f"there is no folder {folder / 'tokenizer'}")
         tokenizer = Qwen2Tokenizer.from_pretrained(folder / "tokenizer", local_files_only=True)
         encoder = Qwen2_5_VLForConditionalGeneration.from_pretrained(folder / "text_encoder", **LOCAL)

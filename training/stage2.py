@@ -1,8 +1,9 @@
 """Stage 2: a LoRA on renders and on real photos at once, for any backbone.
 
-Of a real pair, two photos of one view under different light, nobody knows the Lumi map. The model draws it
-itself: its estimate of the target, with the gradient stopped, is sparsified and becomes the strokes under
-which the source has to be relit. Rendered triplets go on beside, so that it does not lose what it learnt:
+The Lumi map of a real pair, two photos of one view under different light, is unknown. The model draws it: its
+estimate of the target, with the gradient stopped, is sparsified and becomes the strokes under which the
+source must be relit. Training on rendered triplets continues at the same time, so that the model keeps what
+it has learnt:
 
     loss = mean over the real pairs + rendered_weight * mean over the rendered triplets
 
@@ -37,13 +38,16 @@ from dior_rt.training.light import RELIT_SCALE, linear_to_srgb
 
 OPS: Final = NumpyOps()
 SPARSITIES: Final = get_args(Sparsity)
-REAL: Final = 1  # sets the draws of real pairs apart from those of triplets
+REAL: Final = 1  # separates the random draws of real pairs from those of triplets
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """rendered_weight: lambda above. estimate_steps: of the flow, to the light of a target; one step leads to
-    the mean of what is possible, and more to a sample of it."""
+    """The mixture of the two kinds of data.
+
+    rendered_weight: lambda above. estimate_steps: steps of the flow to the light of a target. One step leads
+    to the mean of the possible maps, more steps lead to a sample of them.
+    """
 
     rendered_weight: float = 1.0
     estimate_steps: int = 1
@@ -57,9 +61,9 @@ class Scene:
 
 
 def load_scenes(folder: Path, pattern: str = "*") -> list[Scene]:
-    """The scenes <folder>/<scene>/<photo>, where the names of the photos match `pattern`.
+    """Return the scenes <folder>/<scene>/<photo>, where the names of the photos match `pattern`.
 
-    Only the photos' heads are read. Raises InputError where there is no scene, where one has fewer than two
+    Only the photos' headers are read. Raises InputError where there is no scene, where one has fewer than two
     photos, and where its photos differ in size.
     """
     try:
@@ -93,7 +97,7 @@ def _size(path: Path) -> tuple[int, int]:
 
 
 def real_pair(rng: Generator, scene: Scene, grid: tuple[int, int]) -> Batch:
-    """Two photos of a scene as a triplet without strokes: one window of both, at the grid's size."""
+    """Return two photos of a scene as a triplet without strokes: one window of both, at the grid's size."""
     chosen = rng.choice(len(scene.photos), 2, replace=False)
     photo, relit = (read_photo(scene.photos[k]).pixels for k in chosen)
     rows, columns = _window(rng, photo.shape[:2], grid)
@@ -115,7 +119,7 @@ def real_pair(rng: Generator, scene: Scene, grid: tuple[int, int]) -> Batch:
 
 
 def _window(rng: Generator, size: tuple[int, ...], grid: tuple[int, int]) -> tuple[slice, slice]:
-    """A random part of a picture, of the grid's shape and at least 0.7 of the largest that fits."""
+    """Return a random part of a picture, of the grid's shape and at least 0.7 of the largest that fits."""
     scale = rng.uniform(0.7, 1.0) * min(size[0] / grid[0], size[1] / grid[1])
     height, width = (max(1, round(side * scale)) for side in grid)
     top, left = rng.integers(0, size[0] - height + 1), rng.integers(0, size[1] - width + 1)
@@ -123,9 +127,12 @@ def _window(rng: Generator, size: tuple[int, ...], grid: tuple[int, int]) -> tup
 
 
 class MixedBatches(IterableDataset[Batch]):
-    """Batches of which one half is real pairs and the other rendered triplets. The n-th is always the same.
+    """Batches of which one half is real pairs and the other half rendered triplets.
 
-    `real` (B,) says which a sample is, `weight` (B,) how its error counts, `seed` draws the strokes.
+    The n-th is always the same.
+
+    `real` (B,) marks the real samples, `weight` (B,) is the weight of each error, and `seed` draws the
+    strokes.
     """
 
     def __init__(
@@ -136,7 +143,10 @@ class MixedBatches(IterableDataset[Batch]):
         start: int,
         weight: float,
     ) -> None:
-        """triplets: a stream whose first batch has the number `start`. weight: of the rendered half."""
+        """Store the options.
+
+        triplets: a stream whose first batch has the number `start`. weight: of the rendered half.
+        """
         super().__init__()
         self.scenes, self.triplets = scenes, triplets
         self.seed, self.start, self.weight = seed, start, weight
@@ -146,7 +156,7 @@ class MixedBatches(IterableDataset[Batch]):
             yield self.mix(np.random.default_rng([*self.seed, number]), triplets)
 
     def mix(self, rng: Generator, triplets: Batch) -> Batch:
-        """As many real pairs as there are triplets, of the same grid, before them."""
+        """Put as many real pairs as there are triplets, of the same grid, before them."""
         count, grid = len(triplets["x0"]), (triplets["x0"].shape[2], triplets["x0"].shape[3])
         chosen = rng.integers(len(self.scenes), size=count)
         pairs = [real_pair(rng, self.scenes[k], grid) for k in chosen]
@@ -166,9 +176,9 @@ def fit_stage2(
     mixture: Mixture = Mixture(),
     progress: Progress | None = None,
 ) -> None:
-    """Train what `make` makes on renders and real pairs; resumes where the folder `out` holds a state.
+    """Train the backbone of `make` on renders and real pairs. Resumes where the folder `out` holds a state.
 
-    Raises InputError for an odd batch, and what `fit` raises.
+    Raises InputError for an odd batch, and the errors of `fit`.
     """
     if plan.batch % 2:
         raise InputError(f"Half of a batch is real pairs, so it must be even; {plan.batch} is not.")
@@ -188,7 +198,9 @@ def fit_stage2(
 
 
 def with_estimated_strokes(backbone: Backbone, batch: Batch, steps: int, shift: float) -> Batch:
-    """The batch with strokes for its real pairs, sparsified from what the model sees in their targets."""
+    """Return the batch with strokes for its real pairs, sparsified from the model's estimate of their
+    targets.
+    """
     real, seed = batch["real"], int(batch["seed"])
     target = batch["photo"][real] + batch["x0"][real] / RELIT_SCALE
     lumi = estimate(backbone, target.clamp(0, 1), seed, ShiftSchedule(shift).sigmas(steps).tolist())
@@ -199,7 +211,7 @@ def with_estimated_strokes(backbone: Backbone, batch: Batch, steps: int, shift: 
 
 @torch.no_grad()
 def estimate(backbone: Backbone, photos: Tensor, seed: int, sigmas: list[float]) -> Tensor:
-    """Lumi maps (B, 3, h, w), linear, of photos, sRGB 0..1, as the network now estimates them."""
+    """Return Lumi maps (B, 3, h, w), linear, of photos, sRGB 0..1, as the network now estimates them."""
     count, nothing = len(photos), torch.zeros_like(photos)
     mode = torch.full((count,), MODES["estimate"], device=photos.device)
     asked = {"photo": photos, "light": nothing, "mask": nothing[:, :1], "mode": mode, "x0": nothing}
@@ -212,7 +224,9 @@ def estimate(backbone: Backbone, photos: Tensor, seed: int, sigmas: list[float])
 
 
 def sparsified(lumi: Tensor, rng: Generator) -> tuple[Tensor, Tensor]:
-    """Light (B, 3, h, w) and mask (B, 1, h, w) that a person might have drawn of each map, in any mode."""
+    """Return light (B, 3, h, w) and mask (B, 1, h, w) that a user might have drawn of each map, in any
+    mode.
+    """
     maps = lumi.float().permute(0, 2, 3, 1).cpu().numpy()
     modes = [SPARSITIES[k] for k in rng.integers(len(SPARSITIES), size=len(maps))]
     seeds = rng.integers(2**31, size=len(maps)).tolist()

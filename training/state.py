@@ -1,4 +1,6 @@
-"""What a training run needs to go on: the trained weights, their average, AdamW's moments, and the step."""
+"""The state of a training run that is needed to resume: trained weights, their average, AdamW's moments, the
+step.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,7 @@ from torch import Tensor, nn
 from dior_rt.errors import InputError
 from dior_rt.files import reason, replacing
 
-MOMENTS: Final = {"first": "exp_avg", "second": "exp_avg_sq"}  # our names, and torch's
+MOMENTS: Final = {"first": "exp_avg", "second": "exp_avg_sq"}  # the names of this module, and those of torch
 
 
 class Average:
@@ -38,7 +40,7 @@ class Average:
 
 @dataclass
 class State:
-    """A run after `step` steps. weights: what is trained, in the network's order."""
+    """A run after `step` steps. weights: the trained weights, in the network's order."""
 
     weights: list[nn.Parameter]
     optimizer: torch.optim.Optimizer
@@ -47,7 +49,7 @@ class State:
 
     @contextmanager
     def averaged(self) -> Iterator[None]:
-        """Within it the weights hold their average."""
+        """Set the weights to their average within the block."""
         kept = [weight.detach().clone() for weight in self.weights]
         _fill(self.weights, self.average.values)
         try:
@@ -68,7 +70,7 @@ class State:
             file.write(save(contiguous, {"head": json.dumps(head)}))
 
     def resume(self, path: Path) -> None:
-        """Take up what `store` wrote. Raises InputError for a file of another network, or of another kind."""
+        """Load what `store` wrote. Raises InputError for a file of another network, or of another kind."""
         try:
             with safe_open(path, "pt") as file:
                 head = json.loads(file.metadata()["head"])
@@ -80,7 +82,7 @@ class State:
             _fill(self.weights, [tensors[f"{k}.weight"] for k in range(len(shapes))])
             _fill(self.average.values, [tensors[f"{k}.average"] for k in range(len(shapes))])
             for k, weight in enumerate(self.weights):
-                # In the weight's own layout, which the fused optimiser takes for granted.
+                # The moment gets the layout of the weight, which the fused optimiser requires.
                 moments = {
                     key: torch.empty_like(weight).copy_(tensors[f"{k}.{name}"])
                     for name, key in MOMENTS.items()

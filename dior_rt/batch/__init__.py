@@ -1,1 +1,1 @@
-"""Many photos in one go: find them, match each with its strokes, relight them, and remember what is done."""
+"""Relight many photos: find them, match each with its strokes, relight them, and record what is done."""

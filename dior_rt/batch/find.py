@@ -1,4 +1,4 @@
-"""Find photos: files, folders with all that is in them, patterns, and lists of names."""
+"""Find photos in files, folders with all their contents, patterns, and lists of names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Final
 from dior_rt.batch.match import is_drawing
 from dior_rt.errors import InputError
 
-#: What a folder is searched for. A file that is named is taken whatever its suffix.
+#: The suffixes that are searched for in a folder. A file that is named is taken whatever its suffix.
 SUFFIXES: Final = frozenset(
     (
         *(".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".gif", ".bmp", ".jp2", ".ppm", ".psd", ".exr"),
@@ -24,7 +24,7 @@ _MADE_HERE: Final = ("-relit", "-lumi")
 
 @dataclass(frozen=True)
 class Found:
-    """A photo, and its place below the folder or pattern that it was found by: that of its result, too."""
+    """A photo, and its place below the folder or pattern that found it. Its result gets the same place."""
 
     path: Path
     place: Path
@@ -33,9 +33,9 @@ class Found:
 def find_photos(inputs: Iterable[str], besides: Sequence[Path] = ()) -> list[Found]:
     """Find the photos that the inputs name, each once, in the order of the inputs and then of their names.
 
-    inputs: files, folders (searched to the bottom; hidden files are left out) and patterns such as
-    "day*/*.jpg". besides: files and folders to leave out, such as the results. Raises InputError for an
-    input that is not there.
+    inputs: files, folders (searched recursively; hidden files are left out) and patterns such as
+    "day*/*.jpg". besides: files and folders to leave out, such as the results. Raises InputError for an input
+    that does not exist.
     """
     left_out = [path.resolve() for path in besides]
     found: dict[Path, Found] = {}
@@ -48,7 +48,10 @@ def find_photos(inputs: Iterable[str], besides: Sequence[Path] = ()) -> list[Fou
 
 
 def read_names(data: bytes) -> list[str]:
-    """The names in a list: one a line, or NUL between them as `find -print0` has it. Raises InputError."""
+    """Return the names in a list: one per line, or separated by NUL as by `find -print0`.
+
+    Raises InputError.
+    """
     separator = b"\0" if b"\0" in data else b"\n"
     try:
         return [name.decode().rstrip("\r") for name in data.split(separator) if name.strip()]
@@ -75,7 +78,7 @@ def _expand(text: str) -> list[Found]:
 
 
 def _counts(file: Path, root: Path) -> bool:
-    """Whether a file in a folder is a photo to relight: not hidden, no strokes and no result."""
+    """Return whether a file in a folder is a photo to relight: not hidden, no strokes and no result."""
     return (
         file.suffix.lower() in SUFFIXES
         and not any(part.startswith(".") for part in file.relative_to(root).parts)
@@ -86,7 +89,7 @@ def _counts(file: Path, root: Path) -> bool:
 
 
 def _fixed_part(pattern: Path) -> Path:
-    """The folders ahead of a pattern's first wildcard."""
+    """Return the folders ahead of a pattern's first wildcard."""
     fixed = []
     for part in pattern.parts[:-1]:
         if glob.has_magic(part):

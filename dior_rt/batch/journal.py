@@ -32,7 +32,7 @@ NAME: Final = ".dior-batch.jsonl"
 
 @dataclass(frozen=True)
 class Print:
-    """What tells whether a file has changed."""
+    """The data that shows whether a file has changed."""
 
     size: int
     mtime_ns: int
@@ -40,13 +40,16 @@ class Print:
 
     @classmethod
     def of(cls, path: Path) -> Print:
-        """The print of a file as it is. Raises OSError."""
+        """Return the print of a file in its present state. Raises OSError."""
         with path.open("rb") as file:
             stat = os.fstat(file.fileno())
             return cls(stat.st_size, stat.st_mtime_ns, hashlib.file_digest(file, "sha256").hexdigest())
 
     def fits(self, path: Path) -> bool:
-        """Whether the file still has this content; it is read only where its time has changed."""
+        """Return whether the file still has this content.
+
+        The file is read only where its time has changed.
+        """
         try:
             stat = path.stat()
             if stat.st_size != self.size:
@@ -58,7 +61,7 @@ class Print:
 
 @dataclass(frozen=True)
 class Record:
-    """The last that is known of a result: prints and settings once it is done, nothing if it was begun."""
+    """The latest record of a result: prints and settings once it is done, nothing if it was only begun."""
 
     photo: Print | None = None
     strokes: Print | None = None
@@ -73,11 +76,13 @@ class Record:
 class Journal:
     """The journal in a folder, held by one process at a time. Safe to use from several threads.
 
-    records: by the results' names, as they were when it was opened.
+    records: the records by the results' names, as they were when the journal was opened.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open or begin it. Raises InputError where it cannot be written, or another batch holds it."""
+        """Open or begin the journal. Raises InputError where it cannot be written, or another batch holds
+        it.
+        """
         self._path = folder / NAME
         self._mutex = Lock()
         try:
@@ -90,24 +95,24 @@ class Journal:
         self._file.seek(0)
         data = self._file.read()
         self.records = read_records(data)
-        if data and not data.endswith(b"\n"):  # the last line was cut
+        if data and not data.endswith(b"\n"):  # the last line was cut off
             self._append(b"\n")
 
     def begin(self, result: str) -> None:
-        """Note that the result may be written from now on."""
+        """Record that the result may be written from now on."""
         self._write({"state": "begun", "result": result})
 
     def done(self, result: str, photo: Print, strokes: Print, output: Print, settings: str) -> None:
-        """Note that the result is written."""
+        """Record that the result is written."""
         prints = {name: _pack(p) for name, p in (("photo", photo), ("strokes", strokes), ("output", output))}
         self._write({"state": "done", "result": result, **prints, "settings": settings})
 
     def failed(self, result: str, why: str) -> None:
-        """Note why there is no result."""
+        """Record why there is no result."""
         self._write({"state": "failed", "result": result, "reason": why})
 
     def close(self) -> None:
-        """Let other processes have it."""
+        """Release the journal to other processes."""
         self._file.close()
 
     def __enter__(self) -> Journal:
@@ -131,7 +136,7 @@ class Journal:
 
 
 def read_journal(folder: Path) -> dict[str, Record]:
-    """The records in a folder's journal, by result, without holding it; empty where there is none."""
+    """Return the records in a folder's journal, by result, without locking it. Empty where there is none."""
     try:
         return read_records((folder / NAME).read_bytes())
     except FileNotFoundError:
@@ -141,7 +146,7 @@ def read_journal(folder: Path) -> dict[str, Record]:
 
 
 def read_records(data: bytes) -> dict[str, Record]:
-    """The records by result. A line that is damaged or cut says nothing."""
+    """Return the records by result. A damaged or cut line is ignored."""
     records: dict[str, Record] = {}
     for line in data.splitlines():
         try:
@@ -162,14 +167,14 @@ def _pack(mark: Print) -> list[Any]:
 
 
 def _hold(descriptor: int) -> bool:
-    """Lock the file until it is closed, also by the end of the process; False where another holds it."""
+    """Lock the file until it is closed or the process ends. Returns False where another process holds it."""
     try:
         import fcntl
     except ImportError:  # Windows
         import msvcrt
 
         try:
-            os.lseek(descriptor, 1 << 40, os.SEEK_SET)  # beyond the lines, which others may read
+            os.lseek(descriptor, 1 << 40, os.SEEK_SET)  # beyond the lines, so that others may read them
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
         except OSError:
             return False

@@ -14,7 +14,7 @@ from dior_rt.bench.plan import usable_cores
 from dior_rt.bundle import Bundle
 from dior_rt.relight import Relighter
 
-#: A model with fewer bytes relights one photo on each core; a larger one uses all cores for one photo.
+#: A model with fewer bytes relights one photo on each core. A larger model uses all cores for one photo.
 SMALL_MODEL: Final = 1 << 30
 
 
@@ -31,10 +31,13 @@ class LocalEngine:
     def run(
         self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]
     ) -> Generator[Outcome, None, None]:
-        """Yield the outcomes as they come; `begin` is told each result's name before it may be written."""
+        """Yield the outcomes as they come.
+
+        `begin` is called with each result's name before it may be written.
+        """
         weights = sum((self.bundle.folder / file).stat().st_size for file in self.bundle.manifest.files)
         at_once = self.at_once or (usable_cores() if weights < SMALL_MODEL else 1)
-        # One thread a photo wastes none on waiting for the others; one photo at a time gets all of them.
+        # One thread per photo wastes no time on waiting for other threads. A single photo gets all of them.
         threads = max(1, usable_cores() // at_once) if at_once > 1 else None
         relighter = Relighter(self.bundle.folder, self.device, self.ops, threads)
         if relighter.device != "cpu" and not self.at_once:
@@ -45,5 +48,5 @@ class LocalEngine:
             begin(job.name)
             return relight_file(relighter, job, recipe, turns, stop.is_set)
 
-        # One more than are relit, so that files are read and written meanwhile.
+        # One photo more than are relit, so that files are read and written meanwhile.
         return run_jobs(jobs, work, at_once + 1, self.most_pixels, stop)

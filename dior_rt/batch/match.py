@@ -1,7 +1,7 @@
 """Match a photo with its strokes: beside it, in a folder of strokes, or one drawing for all.
 
-The strokes of a.jpg are a-light or a-strokes with any suffix below, or a with one that no photo has: a.json,
-a.npy, a.dior. In a folder that holds strokes alone, a with any of the suffixes will do.
+The strokes of a.jpg are named a-light or a-strokes with any suffix below, or a with a suffix that no photo
+has: a.json, a.npy, a.dior. In a folder that holds only strokes, a with any of the suffixes matches.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ SUFFIXES: Final = (*NO_PHOTO, ".png", ".exr", ".tif", ".tiff", ".webp", ".jpg", 
 
 
 def is_drawing(path: Path) -> bool:
-    """Whether a file's name says that it holds strokes."""
+    """Return whether a file's name marks it as strokes."""
     return path.stem.endswith(ENDINGS) or path.suffix.lower() in NO_PHOTO
 
 
 def find_strokes(photo: Path, place: Path, strokes: Path | None) -> Path:
-    """The strokes of a photo. Raises InputError where there are none, or more than one.
+    """Return the path of a photo's strokes. Raises InputError where there are none, or more than one.
 
-    place: of the photo below the folder it was found in. strokes: a file for all photos; a folder, which is
-    searched as the photos' own is laid out, and then flat; or None for the photo's own folder.
+    place: the photo's place below the folder in which it was found. strokes: a file for all photos; a folder,
+    which is searched first by the layout of the photos' folder and then flat; or None for the photo's folder.
     """
     if strokes is not None and not strokes.is_dir():
         return strokes

@@ -1,8 +1,8 @@
-"""Carry jobs through worker threads, side by side, within bounds.
+"""Run jobs in parallel worker threads, within bounds.
 
-Each worker takes one photo all the way: decode, relight, encode. So one photo is decoded while another is
-relit and a third encoded; Pillow, NumPy, zlib and ONNX Runtime let other threads run meanwhile. The number of
-workers and the pixels in flight bound the memory.
+Each worker decodes, relights and encodes one photo. So one photo is decoded while another is relit and a
+third encoded; Pillow, NumPy, zlib and ONNX Runtime let other threads run meanwhile. The number of workers and
+the pixels in flight bound the memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from PIL import Image
 from dior_rt.batch.plan import Job
 from dior_rt.batch.work import Outcome
 
-#: Bytes of a file that are taken for one pixel where its header cannot be read: camera raw has about as many.
+#: Bytes of a file that count as one pixel where its header cannot be read. Camera raw has about as many.
 BYTES_PER_PIXEL: Final = 1
 
 
@@ -32,8 +32,8 @@ def run_jobs(
 ) -> Generator[Outcome, None, None]:
     """Yield the outcomes as they come. At most `workers` photos, of `most_pixels` together, are in flight.
 
-    A photo larger than that goes alone. When the caller stops early, or presses Ctrl-C, no further job
-    begins, `stop` is set, and those in flight end first. weigh: `count_pixels`, or another.
+    A photo larger than that is processed alone. When the caller stops early, or presses Ctrl-C, no further
+    job begins, `stop` is set, and the jobs in flight end first. weigh: `count_pixels`, or a function like it.
     """
     weigh = weigh or count_pixels
     flying: dict[Future[Outcome], int] = {}
@@ -54,11 +54,13 @@ def run_jobs(
 
 
 def count_pixels(photo: Path) -> int:
-    """The pixels of a photo by its header, or a guess by its size where it has none that is known."""
+    """Return the pixels of a photo from its header, or an estimate from its file size without a readable
+    header.
+    """
     try:
         with Image.open(photo) as image:
             return image.width * image.height
-    except Exception:  # what is wrong with it is said when it is read
+    except Exception:  # reading the photo later reports what is wrong with it
         try:
             return photo.stat().st_size // BYTES_PER_PIXEL
         except OSError:

@@ -1,4 +1,4 @@
-"""Plan a batch: which photo goes with which strokes into which result, and what needs no work."""
+"""Plan a batch: assign strokes and a result to each photo, and find the photos that need no work."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from dior_rt.images.readers import default_form
 
 @dataclass(frozen=True)
 class Job:
-    """One photo to relight. name: of the result below the folder of results; it is the journal's key."""
+    """One photo to relight.
+
+    name: the result's path below the folder of results, which is the journal's key.
+    """
 
     photo: Path
     strokes: Path
@@ -30,7 +33,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Refused:
-    """A photo that cannot be relit, and why."""
+    """A photo that cannot be relit, and the reason."""
 
     photo: Path
     name: str
@@ -39,7 +42,10 @@ class Refused:
 
 @dataclass(frozen=True)
 class Plan:
-    """jobs: what is to be done. done: photos whose results are there. refused: what cannot be."""
+    """The plan of a batch.
+
+    jobs: the work to do. done: photos whose results exist. refused: photos that cannot be relit.
+    """
 
     jobs: tuple[Job, ...]
     done: tuple[Job, ...]
@@ -57,10 +63,10 @@ def make_plan(
 ) -> Plan:
     """Match the photos with their strokes and results, and compare them with the journal's records.
 
-    form: the results' suffix; None: by each photo. settings: the hash of all that decides the results beside
-    the files. A result that this program wrote and nobody changed since is replaced where its photo, strokes
-    or settings have changed; any other file only with overwrite. Raises InputError where two photos would
-    have the same result.
+    form: the results' suffix, or None to choose it by each photo. settings: the hash of everything besides
+    the files that decides the results. A result that this program wrote and that nobody has changed since is
+    replaced where its photo, strokes or settings have changed. Any other file is replaced only with
+    overwrite. Raises InputError where two photos would have the same result.
     """
     jobs: list[Job] = []
     done: list[Job] = []
@@ -82,13 +88,13 @@ def make_plan(
 
 
 def hash_settings(bundle: str, options: Mapping[str, Any]) -> str:
-    """The hash of what decides results beside the files: the bundle's own hash, and the options."""
+    """Return the hash of what decides results besides the files: the bundle's hash, and the options."""
     text = json.dumps({"bundle": bundle, **options}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _needs_work(job: Job, record: Record | None, settings: str, overwrite: bool) -> bool:
-    """Whether the result is to be made. Raises InputError where that would replace somebody's file."""
+    """Return whether the result must be made. Raises InputError where that would replace a user's file."""
     there = job.result.exists()
     if record and record.output and record.photo and record.strokes:
         unaltered = record.output.fits(job.result)
@@ -100,7 +106,7 @@ def _needs_work(job: Job, record: Record | None, settings: str, overwrite: bool)
         if there and not unaltered and not overwrite:
             raise InputError(f"{job.result} was changed after it was made. Give --overwrite to replace it.")
         return True
-    if record:  # begun and not done: what is there is what a killed process left
+    if record:  # begun and not done: a killed process left this file
         return True
     if there and not overwrite:
         raise InputError(f"{job.result} is there already. Give --overwrite to replace it.")
@@ -108,7 +114,9 @@ def _needs_work(job: Job, record: Record | None, settings: str, overwrite: bool)
 
 
 def _names(photos: Sequence[Found], form: str | None) -> list[str]:
-    """The results' names: a.png, or a.jpg.png and a.cr2.png for photos that differ by their suffix alone."""
+    """Return the results' names: a.png, or a.jpg.png and a.cr2.png for photos that differ only by their
+    suffix.
+    """
     plain = [photo.place.with_suffix("").as_posix() for photo in photos]
     count = Counter(name.casefold() for name in plain)
     names = [

@@ -1,4 +1,4 @@
-"""Say how far a batch is: a line that moves on a terminal, failures as they come, and a last sentence."""
+"""Show the progress of a batch: a line on a terminal, failures as they come, and a last sentence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Clock = Callable[[], float]
 class Progress:
     """Counts outcomes and prints to standard error.
 
-    quiet: print failures alone. total: of the photos to relight. done: results that were there before.
+    quiet: print only failures. total: the number of photos to relight. done: results that existed before.
     """
 
     def __init__(self, total: int, done: int, quiet: bool = False, clock: Clock = monotonic) -> None:
@@ -35,24 +35,24 @@ class Progress:
         self._show(self.line())
 
     def fail(self, photo: str, why: str) -> None:
-        """Count a photo that has no result, and say why."""
+        """Count a photo that has no result, and print the reason."""
         self.failures.append((photo, why))
         self._say(f"{photo}: {why}")
 
     @property
     def seconds(self) -> float:
-        """Since the beginning."""
+        """Return the seconds since the beginning."""
         return self._clock() - self._start
 
     def line(self) -> str:
-        """How far it is, how fast, and how long it will take."""
+        """Return the line of progress: photos done, speed, and time left."""
         ended = self.relit + len(self.failures)
         rate = ended / max(self.seconds, 1e-9)
         left = (self.total - ended) / rate if rate else 0
         return f"{ended} of {self.total}, {_rate(rate)}, {duration(max(left, 0))} left"
 
     def finish(self) -> None:
-        """Print what was done in all."""
+        """Print a summary of the batch."""
         self._show("")
         if self._quiet:
             return
@@ -73,7 +73,7 @@ class Progress:
 
 
 def duration(seconds: float) -> str:
-    """A time as people say it: 8 s, 3 min, 2 h 5 min."""
+    """Return a time in everyday units: 8 s, 3 min, 2 h 5 min."""
     if seconds < 60:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

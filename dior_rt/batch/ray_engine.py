@@ -1,8 +1,8 @@
 """Relight a batch on a cluster, by Ray Data (extra [ray]).
 
 Each actor holds one model and takes one photo at a time, from file to file; the folders must be the same on
-all machines. Starting actors, their number, and doing again what a lost worker left are Ray's work. The
-journal is the driver's: what is in it is not given out again when the driver is started anew.
+all machines. Ray starts actors, chooses their number, and repeats what a lost worker left undone. The driver
+keeps the journal. When the driver is restarted, photos that the journal lists as done are not assigned again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports to its makers otherwise
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # by default, Ray reports usage to its developers
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
 
 import ray
@@ -28,7 +28,8 @@ from dior_rt.bench.plan import usable_cores
 from dior_rt.errors import DeviceError
 from dior_rt.files import reason
 
-#: Tasks in a batch; each takes an equal share of the photos, one unless there are more photos than that.
+#: Tasks in a batch. Each takes an equal share of the photos, which is one unless there are more photos than
+#: tasks.
 MOST_TASKS: Final = 10_000
 
 
@@ -48,8 +49,11 @@ class Worker:
 
 @dataclass(frozen=True)
 class RayEngine:
-    """address: of the cluster, or None for one of its own on this machine. workers: the most actors, or None
-    for one on each core."""
+    """Relights on a Ray cluster.
+
+    address: that of the cluster, or None to start one on this machine. workers: the maximum number of actors,
+    or None for one on each core.
+    """
 
     bundle: Path
     device: str
@@ -60,7 +64,7 @@ class RayEngine:
     def run(
         self, jobs: Iterable[Job], recipe: Recipe, begin: Callable[[str], None]
     ) -> Generator[Outcome, None, None]:
-        """Yield the outcomes as they come; `begin` is told the results' names before any is written.
+        """Yield the outcomes as they come. `begin` is called with the results' names before any is written.
 
         Raises DeviceError where the cluster cannot be reached, or gives up.
         """
@@ -73,8 +77,8 @@ class RayEngine:
             _check_reachable(self.address)
             logging.getLogger("ray").setLevel(logging.ERROR)
             alone: dict[str, Any] = {} if self.address else {"include_dashboard": False}
-            # Ray gives an actor's BLAS one thread. Sums by other numbers of threads round differently, so
-            # actors get as many as the local engine has.
+            # Ray gives an actor's BLAS one thread. Sums with other numbers of threads round differently, so
+            # actors get as many threads as the local engine has.
             threads = os.environ.get("OMP_NUM_THREADS") or str(usable_cores())
             environment = {"env_vars": {"OMP_NUM_THREADS": threads}}
             ray.init(
@@ -110,7 +114,7 @@ class RayEngine:
 
 
 def _check_reachable(address: str | None) -> None:
-    """Raise OSError now where nobody listens at host:port: Ray itself would wait for minutes."""
+    """Raise OSError at once where nothing listens at host:port. Ray itself would wait for minutes."""
     host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
     if colon and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()

@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How all photos of a batch are relit. options: of `Relighter.relight`. key: as `read_drawing` takes it.
-    sidecar: whether an XMP file is written beside each result."""
+    """The options for all photos of a batch.
+
+    options: those of `Relighter.relight`. key: as `read_drawing` takes it. sidecar: whether an XMP file is
+    written beside each result.
+    """
 
     options: Mapping[str, Any] = field(default_factory=dict)
     key: Key | None = None
@@ -37,7 +40,10 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job. error: None where its result is written. The prints are of the files as used."""
+    """The outcome of a job.
+
+    error: None where its result is written. The prints are those of the files as used.
+    """
 
     job: Job
     error: str | None = None
@@ -55,10 +61,10 @@ def relight_file(
     turn: AbstractContextManager[Any] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Outcome:
-    """Relight the photo into its result; what goes wrong is in the outcome, and nothing is half-written.
+    """Relight the photo into its result, which is written whole or not at all, and return errors as outcomes.
 
-    turn: held while the network runs, not while files are read and written.
-    stopped: asked after every step whether to give up.
+    turn: a lock held while the network runs, not while files are read and written.
+    stopped: called after every step; whether to stop.
     """
     start = perf_counter()
     try:
@@ -95,7 +101,7 @@ def relight_file(
         return Outcome(job, "There is not enough memory for it; relight it alone, or make it smaller.")
     except OSError as error:
         return Outcome(job, str(InputError(f"Cannot read {job.photo} or {job.strokes}: {reason(error)}.")))
-    except Exception as error:  # one photo must not end the others' work
+    except Exception as error:  # an error in one photo must not end the work on the others
         return Outcome(job, f"An unexpected error: {type(error).__name__}: {error}")
 
 

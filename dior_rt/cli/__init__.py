@@ -1,4 +1,4 @@
-"""The command line, `dior-rt`. What goes wrong for a known reason is one sentence and exit code 2.
+"""The command line, `dior-rt`. An expected error is reported in one sentence, with exit code 2.
 
 Nothing heavy is imported before a command's body runs: `dior-rt --help` loads neither NumPy nor ONNX Runtime.
 """
@@ -22,19 +22,20 @@ WRONG_USE, UNEXPECTED, INTERRUPTED = 2, 70, 130  # 70 is EX_SOFTWARE of sysexits
 
 
 def main() -> NoReturn:
-    """The console script."""
+    """Run the console script."""
     _repair_streams()
     for name in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # ignored under nohup
             signal.signal(number, _stop)
     sys.exit(run(sys.argv[1:]))
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Carry out a command line and return its exit code.
+    """Run a command line and return its exit code.
 
-    0; 2 for what the user can mend; 70 for what nobody foresaw; 130 for Ctrl-C.
+    The code is 0 for success, 2 for an error that the user can correct, 70 for an unexpected error, and 130
+    for Ctrl-C.
     """
     caught: Exception
     try:
@@ -45,7 +46,7 @@ def run(arguments: Sequence[str]) -> int:
         problem, code, caught = "There is not enough memory for this; try a smaller photo.", WRONG_USE, error
     except Exception as error:
         problem, code, caught = _unexpected(error), UNEXPECTED, error
-    # Looked up here, for a command may fail before its options are known.
+    # The option is looked up here, because a command may fail before its options are parsed.
     if "--debug" in arguments and sys.stderr is not None:
         traceback.print_exception(caught)
     return _refuse(problem, code)
@@ -57,7 +58,7 @@ def _run(arguments: Sequence[str]) -> int:
     command = typer.main.get_command(app)
     try:
         return command.main(list(arguments), prog_name="dior-rt", standalone_mode=False) or 0
-    except typer.TyperException as error:  # an option or argument that does not parse
+    except typer.TyperException as error:  # an option or argument cannot be parsed
         return _refuse(error.format_message(), WRONG_USE)
     except (typer.Abort, KeyboardInterrupt):
         return INTERRUPTED
@@ -71,21 +72,21 @@ def _refuse(problem: str, code: int) -> int:
 
 
 def _unexpected(error: Exception) -> str:
-    """A sentence for an error that no part of the program translated."""
+    """Return a sentence for an error that no part of the program translated."""
     text = " ".join(str(error).split())
     told = f"{type(error).__name__}: {text:.200}" if text else type(error).__name__
     return f"Something went wrong that was not foreseen ({told}); --debug shows the details"
 
 
 def _stop(number: int, frame: FrameType | None) -> NoReturn:
-    """End as the signal asks, but by way of every `finally`, so that no half-written file stays."""
+    """Stop as the signal asks, but run every `finally`, so that no half-written file remains."""
     raise SystemExit(128 + number)
 
 
 def _repair_streams() -> None:
-    """Open what the shell has closed (`2>&-`), and print any file name.
+    """Open the streams that the shell has closed (`2>&-`), and make them able to print any file name.
 
-    Without it the next file that is opened would become the standard error, and get a library's messages.
+    Otherwise the next opened file would become the standard error and receive a library's messages.
     """
     for descriptor in range(3):
         try:

@@ -1,4 +1,4 @@
-"""The commands that tell what is there."""
+"""The commands that show the available devices and the content of a bundle."""
 
 from __future__ import annotations
 

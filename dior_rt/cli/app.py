@@ -1,4 +1,4 @@
-"""The commands by name; each is imported, and its options are built, when somebody asks for it."""
+"""The commands by name. Each is imported, and its options are built, when it is requested."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ COMMANDS = {
 
 
 class Commands(TyperGroup):
-    """COMMANDS, and the groups that the app adds."""
+    """The group of COMMANDS and of the groups that the app adds."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Their names."""
+        """Return the names of the commands."""
         return [*COMMANDS, *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """One of them, or None."""
+        """Return a command, or None."""
         if cmd_name not in COMMANDS:
             return super().get_command(ctx, cmd_name)
         body = getattr(import_module(f"dior_rt.cli.{COMMANDS[cmd_name]}"), cmd_name)
@@ -48,7 +48,7 @@ class Commands(TyperGroup):
         return typer.main.get_command(alone)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run one of them, with a person's own defaults."""
+        """Run a command with the user's defaults."""
         from dior_rt.cli.defaults import COMMANDS, Default, defaults_of, read_defaults
 
         defaults = read_defaults()
@@ -57,7 +57,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            # An option that nobody typed came from a default, and the person must know from which.
+            # An option that the user did not type came from a default, so the error must name the default.
             param = error.param
             setting = "" if param is None else str(param.name).replace("_", "-")
             from_default: list[Default] = [d for d in defaults if d.setting == setting]
@@ -89,18 +89,18 @@ def dior_rt(
 
 
 class TrainGroup(TyperGroup):
-    """The commands of dior_rt.training.cli, imported on the first question about them."""
+    """The commands of dior_rt.training.cli, which is imported when they are first requested."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Their names."""
+        """Return the names of the commands."""
         return _training().list_commands(ctx)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """One of them, or None."""
+        """Return a command, or None."""
         return _training().get_command(ctx, cmd_name)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run one of them."""
+        """Run a command."""
         with needs_extra("train"):
             return super().invoke(ctx)
 

@@ -182,7 +182,7 @@ def batch(
 
 
 def _listed(text: str, read_names: Callable[[bytes], list[str]]) -> list[str]:
-    """The input itself, or where it is - the names on standard input."""
+    """Return the input, or where it is "-" the names on standard input."""
     if text != "-":
         return [text]
     if sys.stdin.isatty():

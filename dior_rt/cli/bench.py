@@ -118,7 +118,7 @@ def bench(
 
 
 def _kernels(asked: list[str] | None) -> list[str]:
-    """The pixel kernels to measure; the reference's first: the best, or the first asked for."""
+    """Return the pixel kernels to measure. The first is the reference: the best, or the first requested."""
     from dior_rt.kernels import KernelError, list_devices, open_ops
 
     try:
@@ -135,19 +135,19 @@ def _kernels(asked: list[str] | None) -> list[str]:
 
 
 def _lpips() -> Distance:
-    """LPIPS with AlexNet, as most papers report it."""
+    """Return LPIPS with AlexNet, as most papers report it."""
     with needs_extra("lpips", "bench --lpips"):
         from dior_rt.training.evaluation.lpips import Lpips
     return Lpips("alex")
 
 
 def _short(name: str) -> str:
-    """opencl:0 of "opencl:0 (the device's name)"."""
+    """Return opencl:0 for "opencl:0 (the device's name)"."""
     return name.partition(" ")[0]
 
 
 def _pairs(files: list[Path], stack: ExitStack, megapixels: float) -> list[Pair]:
-    """The photos and strokes that were named, or a synthetic pair that lives as long as the stack."""
+    """Return the named photos and strokes, or a synthetic pair that exists as long as the stack."""
     from dior_rt.bench.scene import write_scene
     from dior_rt.bench.worker import Pair
 
@@ -161,7 +161,7 @@ def _pairs(files: list[Path], stack: ExitStack, megapixels: float) -> list[Pair]
 
 @contextmanager
 def _progress(runs: int) -> Iterator[Callable[[str], None]]:
-    """A callback that moves a bar on a terminal, and does nothing elsewhere."""
+    """Yield a callback that moves a bar on a terminal, and does nothing elsewhere."""
     if not sys.stderr.isatty():
         yield lambda name: None
         return
@@ -170,7 +170,7 @@ def _progress(runs: int) -> Iterator[Callable[[str], None]]:
 
         def advance(name: str) -> None:
             bar.label = f"Measuring {name}"
-            bar.update(next(begun) - bar.pos)  # told before a run, so the bar shows those that are done
+            bar.update(next(begun) - bar.pos)  # called before a run, so the bar shows the finished runs
 
         yield advance
         bar.update(runs - bar.pos)

@@ -1,4 +1,4 @@
-"""The command that makes a bundle, of a network that was trained here or of Qwen-Image-Edit."""
+"""The command that makes a bundle from a network that was trained here or from Qwen-Image-Edit."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def export(
 
 
 def _schedule(shift: float) -> ShiftSchedule:
-    from dior_rt.flow.schedule import ShiftSchedule  # numpy is not for --help
+    from dior_rt.flow.schedule import ShiftSchedule  # --help does not need numpy
 
     try:
         return ShiftSchedule(shift)
@@ -157,7 +157,7 @@ def _schedule(shift: float) -> ShiftSchedule:
 
 
 def _path_and_strength(text: str) -> tuple[Path, float]:
-    """FILE or FILE:STRENGTH; a colon that no number follows is part of the name."""
+    """Return the parts of FILE or FILE:STRENGTH. A colon without a number after it is part of the name."""
     path, _, strength = text.rpartition(":")
     try:
         return (Path(path), float(strength)) if path else (Path(text), 1.0)
@@ -166,6 +166,6 @@ def _path_and_strength(text: str) -> tuple[Path, float]:
 
 
 def _show(file: str) -> None:
-    """Tell of a part that is written, where somebody watches: a whole model takes hours."""
+    """Print each part that is written, on a terminal only: a whole model takes hours."""
     if sys.stderr.isatty():
         typer.echo(f"written: {file}", err=True)

@@ -1,6 +1,6 @@
-"""Defaults of a person's own: a configuration file, and environment variables over it.
+"""The user's defaults: a configuration file, and environment variables that override it.
 
-The file is ~/.config/dior-rt/config.toml (%APPDATA%\\dior-rt on Windows), or what DIOR_CONFIG names:
+The file is ~/.config/dior-rt/config.toml (%APPDATA%\dior-rt on Windows), or what DIOR_CONFIG names:
 
     preset = "fast"        # for every command that has the option
     device = "cpu"
@@ -28,7 +28,7 @@ PREFIX: Final = "DIOR_"
 CONFIG: Final = "DIOR_CONFIG"
 MOST_BYTES: Final = 1 << 20
 
-#: The options that may have a default of one's own: how to work, not what to work on.
+#: The options that may have a default: they say how to work, not what to work on.
 SETTINGS: Final = (
     *("bundle", "device", "ops", "preset", "steps", "solver", "shift", "guidance", "interval", "tolerance"),
     *("seed", "intensity", "reach", "format", "overwrite", "quiet", "at-once", "in-flight"),
@@ -38,7 +38,10 @@ COMMANDS: Final = ("relight", "batch", "estimate", "devices", "bench")
 
 @dataclass(frozen=True)
 class Default:
-    """One default. command: the one it is for; None: all that have the option. source: where it stands."""
+    """One default.
+
+    command: the command it applies to, or None for all that have the option. source: its place.
+    """
 
     setting: str
     value: str | list[str]
@@ -47,7 +50,7 @@ class Default:
 
 
 def config_path(environment: Mapping[str, str] = os.environ) -> Path:
-    """Where the configuration file is, or would be."""
+    """Return the path of the configuration file, whether or not it exists."""
     if named := environment.get(CONFIG):
         return Path(named)
     if sys.platform == "win32" and (folder := environment.get("APPDATA")):
@@ -59,7 +62,10 @@ def config_path(environment: Mapping[str, str] = os.environ) -> Path:
 
 
 def read_defaults(environment: Mapping[str, str] = os.environ) -> list[Default]:
-    """The defaults in force, later over earlier ones. Raises InputError for a file that makes no sense."""
+    """Return the defaults in order, so that later ones override earlier ones.
+
+    Raises InputError for an invalid file.
+    """
     found = _read_file(config_path(environment), must=CONFIG in environment)
     for setting in SETTINGS:
         name = variable(setting)
@@ -69,7 +75,7 @@ def read_defaults(environment: Mapping[str, str] = os.environ) -> list[Default]:
 
 
 def defaults_of(command: str, defaults: list[Default]) -> dict[str, str | list[str]]:
-    """A command's defaults, by the names of its parameters."""
+    """Return a command's defaults, by the names of its parameters."""
     general = {d.setting: d.value for d in defaults if d.command is None and not d.source.startswith(PREFIX)}
     special = {d.setting: d.value for d in defaults if d.command == command}
     variables = {d.setting: d.value for d in defaults if d.source.startswith(PREFIX)}
@@ -78,13 +84,13 @@ def defaults_of(command: str, defaults: list[Default]) -> dict[str, str | list[s
 
 
 def unknown_variables(environment: Mapping[str, str] = os.environ) -> list[str]:
-    """Variables that look like defaults and are none."""
+    """Return the variables that look like defaults but are none."""
     choices = {CONFIG, *map(variable, SETTINGS)}
     return sorted(name for name in environment if name.startswith(PREFIX) and name not in choices)
 
 
 def variable(setting: str) -> str:
-    """The environment variable of a setting: DIOR_AT_ONCE."""
+    """Return the environment variable of a setting, such as DIOR_AT_ONCE."""
     return PREFIX + setting.upper().replace("-", "_")
 
 

@@ -110,7 +110,7 @@ def relight(
     encoding = Encoding(quality, int(bits) if bits else None)
     out = _with_format(out or photo.with_name(f"{photo.stem}-relit.{format or default_form(photo)}"), format)
     project = read_project(strokes) if strokes.suffix.lower() == SUFFIX else None
-    if project:  # its settings hold unless the command line says otherwise
+    if project:  # the project's settings apply unless the command line overrides them
         preset, steps = preset or project.settings.preset, steps or project.settings.steps
         seed, intensity = seed or project.settings.seed, intensity * project.settings.intensity
     _refuse_same(out, photo, strokes)
@@ -237,10 +237,10 @@ def sparsify(
 
 
 class Watch(Stopwatch):
-    """Seconds by stage, and until the first step of the sampler."""
+    """Measures the seconds of each stage, and the seconds until the first step of the sampler."""
 
     def first_step(self, advance: Callable[[int, int], None]) -> Callable[[int, int], None]:
-        """`advance`, which also notes when it is called first."""
+        """Call `advance`, and note the time of the first call."""
 
         def noted(step: int, steps: int) -> None:
             self.seconds.setdefault("first_step", perf_counter() - self.start)
@@ -251,7 +251,7 @@ class Watch(Stopwatch):
 
 @contextmanager
 def _loading(bundle: Path | None, device: str, ops: str) -> Iterator[Callable[[], Relighter]]:
-    """Load the model while the block reads pictures; the function that it gets waits for the model."""
+    """Load the model while the block reads pictures. The function that the block gets waits for the model."""
 
     def load() -> Relighter:
         from dior_rt.relight import Relighter
@@ -292,14 +292,14 @@ def _warn(notice: str) -> None:
 
 
 def _refuse_same(out: Path, *inputs: Path) -> None:
-    """Raise InputError where the result would replace one of the files it is made from."""
+    """Raise InputError where the result would replace one of the files that it is made from."""
     for path in inputs:
         if is_same_file(out, path):
             raise InputError(f"{out} is read from; name another file for the result.")
 
 
 def _with_format(out: Path, form: str | None) -> Path:
-    """The result's name, which ends as --format says where it has no ending. Raises InputError."""
+    """Return the result's name, with the suffix of --format where it has none. Raises InputError."""
     if form is None:
         return out
     if not out.suffix:
@@ -312,7 +312,7 @@ def _with_format(out: Path, form: str | None) -> Path:
 
 @contextmanager
 def _progress(label: str, quiet: bool = False) -> Iterator[Callable[[int, int], None]]:
-    """A callback that moves a bar on a terminal, and does nothing elsewhere."""
+    """Yield a callback that moves a bar on a terminal, and does nothing elsewhere."""
     if quiet or not sys.stderr.isatty():
         yield lambda step, steps: None
         return

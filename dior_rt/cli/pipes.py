@@ -1,4 +1,4 @@
-"""`-` in place of a file's name: standard input, and standard output."""
+"""Read standard input and write standard output where `-` stands in place of a file's name."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def _check_output(arguments: dict[str, Any]) -> None:
 
 
 def _spool(folder: Path) -> Path:
-    """Copy standard input to a file whose suffix says what it is."""
+    """Copy standard input to a file whose suffix names its format."""
     if sys.stdin.isatty():
         raise InputError("Standard input is a terminal. Pipe a file into the command, or name one.")
     spool, length = folder / "in", 0
@@ -80,18 +80,21 @@ def _spool(folder: Path) -> Path:
 
 
 def suffix_of(head: bytes) -> str:
-    """The suffix that fits a file's first bytes; ".png" for pictures, which are told apart later."""
+    """Return the suffix that fits a file's first bytes.
+
+    All pictures get ".png" and are distinguished later.
+    """
     signatures = {b"\x76\x2f\x31\x01": ".exr", b"\x93NUMPY": ".npy", b"PK\x03\x04": ".dior"}
     for signature, suffix in signatures.items():
         if head.startswith(signature):
             return suffix
-    # Text may begin with a byte order mark, and in UTF-16 every other byte is 0.
+    # Text may begin with a byte order mark, and in UTF-16 every other byte of ASCII text is 0.
     text = head.lstrip(b"\xef\xbb\xbf\xff\xfe\0 \t\r\n")
     return ".json" if text[:1] in (b"[", b"{") else ".png"
 
 
 def _renamed(error: DiorError, names: dict[str, str]) -> DiorError:
-    """The same error, with what the person typed in place of the temporary names."""
+    """Return the same error with the user's names in place of the temporary ones."""
     text = str(error)
     for name, shown in names.items():
         text = text.replace(name, shown)

@@ -1,4 +1,4 @@
-"""How the commands lay out what they print."""
+"""Lay out what the commands print."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from dior_rt.files import reason
 
 
 def say(text: str) -> None:
-    """Print a result. Raises InputError where standard output takes none, for example on a full disk."""
+    """Print a result. Raises InputError where standard output accepts none, for example on a full disk."""
     try:
         typer.echo(text)
         sys.stdout.flush()
-    except BrokenPipeError:  # who reads it has seen enough; the command line's frame ends quietly
+    except BrokenPipeError:  # the reader has closed the pipe; the command line's frame ends without a message
         raise
     except OSError as error:
-        # What is still in the buffer would fail once more when Python ends.
+        # Otherwise Python would fail once more at its end, when it flushes the buffer.
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, 1)
         os.close(nothing)

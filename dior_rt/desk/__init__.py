@@ -1,1 +1,1 @@
-"""The light desk: a page on this machine where light is drawn on a photo; the extra `desk`."""
+"""The light desk: a page on this machine where the user draws light on a photo. It needs the extra `desk`."""

@@ -1,4 +1,4 @@
-"""The studio over HTTP: the page's files, and what the page asks for. Errors are {"error": sentence}."""
+"""The studio over HTTP: the page's files, and the requests of the page. Errors are {"error": sentence}."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TYPES: Final = {
 
 
 def make_app(studio: Studio, token: str, hosts: frozenset[str], first: Path | None = None) -> FastAPI:
-    """The application. first: a photo to put on the desk when the page asks for it."""
+    """Return the application. first: a photo to put on the desk when the page asks for it."""
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -82,7 +82,7 @@ def _add_page(app: FastAPI) -> None:
 def _add_photos(app: FastAPI, studio: Studio, first: Path | None) -> None:
     @app.get("/api/desk")
     def desk() -> dict[str, Any]:
-        """What the page should know at its start. Waits for the model."""
+        """Return the data that the page needs at its start. Waits for the model."""
         relighter = studio.relighter
         return {
             "version": __version__,
@@ -122,7 +122,7 @@ def _add_photos(app: FastAPI, studio: Studio, first: Path | None) -> None:
 
     @app.get("/api/photos/{photo}/picture")
     def picture(photo: str, longest: int = MOST_PREVIEW) -> Response:
-        """The photo as it is, at the size of a preview."""
+        """Return the photo as it is, at the size of a preview."""
         size = min(max(longest, 1), MOST_PREVIEW)
         shown = _photo(studio, photo)
         return Response(encode_jpeg(shown.open.small(size), shown.file), media_type="image/jpeg")
@@ -133,7 +133,9 @@ def _add_light(app: FastAPI, studio: Studio) -> None:
     async def preview(
         request: Request, photo: str, page: str = "", number: int = 0, longest: int = 1024
     ) -> Response:
-        """A JPEG of the photo under the project's lights; 204 where the page has asked again since."""
+        """Return a JPEG of the photo under the project's lights, or 204 where the page has since asked
+        again.
+        """
         shown, is_newest = _photo(studio, photo), studio.newest.note(page[:64], number)
         project = await _project(request)
         size = min(max(longest, 16), MOST_PREVIEW)
@@ -145,12 +147,14 @@ def _add_light(app: FastAPI, studio: Studio) -> None:
 
     @app.get("/api/photos/{photo}/source")
     def source(photo: str) -> Response:
-        """The model's estimate of the light on the photo: float32, row by row, RGB."""
+        """Return the model's estimate of the light on the photo: float32, row by row, RGB."""
         return _raster(_photo(studio, photo).open.source_map())
 
     @app.post("/api/photos/{photo}/target")
     async def target(request: Request, photo: str) -> Response:
-        """What the project's lights ask for, on the light grid: float32, row by row, RGB and the mask."""
+        """Return the light that the project's lights ask for, on the light grid: float32, row by row, RGB and
+        the mask.
+        """
         shown, project = _photo(studio, photo), await _project(request)
         asked = await run_in_threadpool(studio.target, shown, project)
         return _raster(np.dstack([asked.light, asked.mask]))
@@ -168,7 +172,7 @@ def _add_jobs(app: FastAPI, studio: Studio) -> None:
 
     @app.get("/api/jobs/{job}/events")
     def events(job: str) -> StreamingResponse:
-        """The job's states as server-sent events, until it is over."""
+        """Stream the job's states as server-sent events, until it is over."""
         states = _job(studio, job).states()
 
         def stream() -> Iterator[str]:
@@ -183,14 +187,14 @@ def _add_jobs(app: FastAPI, studio: Studio) -> None:
 
     @app.get("/api/jobs/{job}/picture")
     def picture(job: str, longest: int = MOST_PREVIEW) -> Response:
-        """The result at the size of a preview."""
+        """Return the result at the size of a preview."""
         relit = _result(studio, job).photo
         pixels = shrink(relit, min(max(longest, 16), MOST_PREVIEW))
         return Response(encode_jpeg(pixels, relit), media_type="image/jpeg")
 
     @app.get("/api/jobs/{job}/file")
     def export(job: str, kind: str = "png") -> Response:
-        """The file that `dior-rt relight` would write of the project."""
+        """Return the file that `dior-rt relight` would write for the project."""
         if kind not in FORMATS:
             raise HTTPException(400, f"The format must be one of {', '.join(FORMATS)}.")
         media_type, suffix = FORMATS[kind]
@@ -200,12 +204,12 @@ def _add_jobs(app: FastAPI, studio: Studio) -> None:
 def _add_projects(app: FastAPI, studio: Studio) -> None:
     @app.post("/api/projects/pack")
     async def pack_project(request: Request) -> Response:
-        """The file of a project."""
+        """Return a project as a file."""
         return Response(pack(await _project(request)), media_type="application/zip")
 
     @app.post("/api/projects/unpack")
     async def unpack_project(request: Request) -> Response:
-        """The project of a file, as JSON."""
+        """Return the project in a file, as JSON."""
         data = await _body(request, MOST_BYTES)
         try:
             project = unpack(data)
@@ -215,7 +219,7 @@ def _add_projects(app: FastAPI, studio: Studio) -> None:
 
     @app.post("/api/photos/{photo}/layers")
     async def layers(request: Request, photo: str, kind: str = "ora") -> Response:
-        """The lights as layers for other programs."""
+        """Return the lights as layers for other programs."""
         if kind not in LAYER_FORMATS:
             raise HTTPException(400, f"The format must be one of {', '.join(LAYER_FORMATS)}.")
         shown, project = _photo(studio, photo), await _project(request)
@@ -275,7 +279,10 @@ async def _body(request: Request, most: int) -> bytes:
 
 
 async def _limited(request: Request, most: int) -> AsyncIterator[bytes]:
-    """The body's parts; 413 as soon as it is, or says it will be, longer than `most` bytes."""
+    """Yield the body's parts.
+
+    Raises 413 as soon as the body is, or declares that it will be, longer than `most` bytes.
+    """
     announced = request.headers.get("content-length", "0")
     seen = int(announced) if announced.isdigit() else 0
     if seen <= most:

@@ -1,8 +1,8 @@
-"""Who may speak to the server: the page that has the link, from this machine, and nobody else.
+"""Access control: only the page that has the link, on this machine, may speak to the server.
 
-Every address begins with a random token, which only the printed link has. A request is refused whose Host is
-not this server (DNS rebinding), or whose Origin is another page (cross-site requests). Answers may not be
-framed, kept by caches, or load anything from elsewhere.
+Every address begins with a random token, which only the printed link contains. A request is refused if its
+Host is not this server (DNS rebinding), or if its Origin is another page (cross-site requests). Answers may
+not be framed, kept by caches, or load anything from elsewhere.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ STRANGER: Final = "Open the link that dior-rt printed; addresses without its tok
 
 
 def new_token() -> str:
-    """A token that cannot be guessed: 192 random bits."""
+    """Return a token that cannot be guessed: 192 random bits."""
     return secrets.token_urlsafe(24)
 
 
 class Guard:
-    """Middleware that lets through what begins with /TOKEN/ and comes from this server's own page."""
+    """Middleware that admits requests that begin with /TOKEN/ and come from this server's own page."""
 
     def __init__(self, app: ASGIApp, token: str, hosts: frozenset[str]) -> None:
-        """hosts: the values of the header Host that are this server."""
+        """Store the application. hosts: the values of the header Host that name this server."""
         self.app, self.token, self.hosts = app, token, hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 403, or pass the request on with the token taken off its path."""
+        """Answer 403, or pass the request on with the token removed from its path."""
         if scope["type"] != "http":
             if scope["type"] == "lifespan":
                 await self.app(scope, receive, send)

@@ -1,4 +1,4 @@
-"""Work that takes a while: one job at a time, in order, with progress that others can follow, and cancel."""
+"""Run long work: one job at a time, in order, with progress that others can follow, and with cancellation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ FINAL: Final = ("done", "failed", "cancelled")
 
 @dataclass(frozen=True)
 class State:
-    """Where a job stands. ahead: jobs before it; step, steps: of the sampler; message: what went wrong."""
+    """The state of a job.
+
+    ahead: jobs before it; step, steps: those of the sampler; message: what went wrong.
+    """
 
     stage: Stage
     ahead: int = 0
@@ -29,7 +32,7 @@ class State:
 
 
 class Job:
-    """One piece of work, its state, and in the end its result."""
+    """One piece of work, its state, and finally its result."""
 
     def __init__(self, work: Callable[[Job], Any]) -> None:
         self.id = secrets.token_urlsafe(9)
@@ -41,11 +44,11 @@ class Job:
 
     @property
     def state(self) -> State:
-        """Where it stands now."""
+        """Return the present state."""
         return self._state
 
     def progress(self, step: int, steps: int) -> bool:
-        """Note a step; False asks the work to stop. To be passed to `Relighter.relight`."""
+        """Record a step. Returns False to stop the work. The caller passes this to `Relighter.relight`."""
         self.move(replace(self._state, step=step, steps=steps))
         return not self._cancelled
 
@@ -54,8 +57,10 @@ class Job:
         self._cancelled = True
 
     def states(self, patience: float = 15.0) -> Iterator[State | None]:
-        """Its states as they change, the present one first, until a final one; None after `patience` seconds
-        without a change."""
+        """Yield the states as they change, from the present one to a final one.
+
+        Yields None after `patience` seconds without a change.
+        """
         seen: State | None = None
         while seen is None or seen.stage not in FINAL:
             with self._changed:
@@ -66,13 +71,13 @@ class Job:
             seen = news or seen
 
     def move(self, state: State) -> None:
-        """Change the state, and wake who follows it."""
+        """Change the state, and wake the threads that follow it."""
         with self._changed:
             self._state = state
             self._changed.notify_all()
 
     def run(self) -> None:
-        """Carry the work out; its errors become the state."""
+        """Run the work. Its errors become the state."""
         if self._cancelled:
             return self.move(State("cancelled"))
         self.move(State("running"))
@@ -90,17 +95,20 @@ class Job:
 
 
 class Queue:
-    """Jobs in the order of their coming, of which one runs at a time. The last results are kept."""
+    """Jobs in the order of arrival, one of which runs at a time. The last results are kept."""
 
     def __init__(self, kept: int = 4, waiting: int = 8) -> None:
-        """kept: jobs that are over, with their results; waiting: jobs that may stand in the queue."""
+        """Start the queue.
+
+        kept: the number of finished jobs with results; waiting: the number of jobs that may wait.
+        """
         self._kept, self._most_waiting = kept, waiting
         self._jobs: OrderedDict[str, Job] = OrderedDict()
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(1, "relight")
 
     def submit(self, work: Callable[[Job], Any]) -> Job | None:
-        """A new job at the end of the queue, or None where too many wait."""
+        """Add a job at the end of the queue and return it, or None where too many wait."""
         with self._lock:
             if len(self._open()) > self._most_waiting:
                 return None
@@ -114,11 +122,11 @@ class Queue:
         return job
 
     def get(self, name: str) -> Job | None:
-        """A job by its id, or None."""
+        """Return a job by its id, or None."""
         return self._jobs.get(name)
 
     def close(self) -> None:
-        """Cancel what waits and runs, and wait for it."""
+        """Cancel the waiting and running jobs, and wait for the running one."""
         for job in self._open():
             job.cancel()
         self._pool.shutdown(wait=True, cancel_futures=True)

@@ -1,8 +1,8 @@
-"""Lights as layers for other programs: OpenRaster for Krita and GIMP, EXR, and a zip of PNGs.
+"""Write lights as layers for other programs: OpenRaster for Krita and GIMP, EXR, and a zip of PNGs.
 
 Each light becomes an RGBA layer of the photo's size: its colour is the drawn light times strength and tint,
-alpha is the coverage. EXR keeps any strength, premultiplied as EXR has it; PNG and OpenRaster clip at display
-white.
+and its alpha is the coverage. EXR keeps any strength, premultiplied as EXR requires. PNG and OpenRaster clip
+at display white.
 """
 
 from __future__ import annotations
@@ -31,13 +31,16 @@ LAYER_FORMATS: Final = {
     "png": "application/zip",
 }
 
-#: How OpenRaster calls the blend modes; a light that is set lies over the photo.
+#: OpenRaster's names of the blend modes. A light with blend "set" lies over the photo.
 _COMPOSITES: Final = {"set": "svg:src-over", "add": "svg:plus", "multiply": "svg:multiply"}
-_THUMBNAIL: Final = 256  # pixels a side, by the OpenRaster specification
+_THUMBNAIL: Final = 256  # pixels per side, by the OpenRaster specification
 
 
 def write_layers(photo: Photo, lights: Sequence[Light], kind: str, folder: Path) -> bytes:
-    """The lights in one file of a LAYER_FORMATS kind, the first at the bottom. Raises InputError for none."""
+    """Write the lights in one file of a LAYER_FORMATS kind, the first at the bottom.
+
+    Raises InputError for no lights.
+    """
     if not lights:
         raise InputError("There is no light to export.")
     if kind == "exr":
@@ -47,7 +50,7 @@ def write_layers(photo: Photo, lights: Sequence[Light], kind: str, folder: Path)
 
 
 def _raster(light: Light, size: tuple[int, int]) -> NDArray[np.float32]:
-    """(H, W, 4): linear light times strength and tint, and coverage, at the photo's size."""
+    """Return (H, W, 4): linear light times strength and tint, and coverage, at the photo's size."""
     assert isinstance(light.drawn, Strokes)
     factor = np.float32(light.strength) * np.asarray(light.tint, np.float32)
     planes = np.dstack([light.drawn.light * factor, light.drawn.mask])
@@ -81,7 +84,7 @@ def _ora(photo: Photo, lights: Sequence[Light], pictures: Sequence[bytes]) -> by
     thumbnail.thumbnail((_THUMBNAIL, _THUMBNAIL))
     return _archive(
         {
-            "mimetype": b"image/openraster",  # first and stored, so that the kind is seen without unzipping
+            "mimetype": b"image/openraster",  # first and stored, to be readable without unzipping
             "stack.xml": xml.encode(),
             "data/photo.png": _png(pixels),
             **dict(zip(names, pictures, strict=True)),
@@ -116,7 +119,7 @@ def _exr(photo: Photo, lights: Sequence[Light], folder: Path) -> bytes:
 
 
 def _plain(name: str) -> str:
-    """A name without what file systems and channel names cannot hold."""
+    """Return a name without characters that file systems and channel names cannot hold."""
     return re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-").lower()[:40] or "light"
 
 
@@ -128,7 +131,7 @@ def _png(pixels: NDArray[np.uint8]) -> bytes:
 
 def _archive(contents: dict[str, bytes]) -> bytes:
     file = io.BytesIO()
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:  # PNG is packed already
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:  # PNG is already compressed
         for name, data in contents.items():
             archive.writestr(zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0)), data)
     return file.getvalue()

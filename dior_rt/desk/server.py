@@ -22,7 +22,7 @@ from dior_rt.relight import Relighter
 
 HOST: Final = "127.0.0.1"
 
-#: The port unless one is asked for. Browsers keep drawings by port, so it should be the same each time.
+#: The default port. Browsers store drawings by port, so it should be the same each time.
 USUAL_PORT: Final = 8642
 
 
@@ -35,9 +35,9 @@ def run_desk(
 ) -> None:
     """Serve the desk on the loopback interface until Ctrl-C.
 
-    load: makes the model. photo: to begin with. port: 0 takes a free one; None takes USUAL_PORT, or a free
-    one where that is taken. browse: open the page. say: gets the link. Raises InputError for a port that is
-    taken.
+    load: the function that makes the model. photo: the photo to begin with. port: 0 takes a free one; None
+    takes USUAL_PORT, or a free one where that is taken. browse: whether to open the page. say: the function
+    that is called with the link. Raises InputError for a port that is taken.
     """
     token = new_token()
     with _listen(port) as listener, tempfile.TemporaryDirectory(prefix="dior-desk-") as folder:
@@ -59,10 +59,10 @@ def _listen(port: int | None) -> socket.socket:
             return _listen(USUAL_PORT)
     listener = socket.socket()
     try:
-        if os.name != "nt":  # there it would let two programs share the port
+        if os.name != "nt":  # on Windows it would let two programs share the port
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((HOST, port or 0))
-        listener.listen()  # so that who follows the link at once waits and is not refused
+        listener.listen()  # now, so that a browser that follows the link at once is not refused
         return listener
     except (OSError, OverflowError) as error:
         listener.close()

@@ -1,4 +1,4 @@
-"""What the server does, without HTTP: photos that stay open, previews, full results, exports."""
+"""The server's work, without HTTP: photos that stay open, previews, full results, exports."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from dior_rt.lights import Light
 from dior_rt.project import Project, hash_file, lights_of
 from dior_rt.relight import OpenPhoto, Relighter
 
-MOST_PHOTOS: Final = 3  # that stay open; the one unused for longest is closed
-QUALITY: Final = 92  # of JPEG previews
+MOST_PHOTOS: Final = 3  # photos that stay open; the least recently used one is closed
+QUALITY: Final = 92  # the quality of JPEG previews
 MOST_PREVIEW: Final = 2048  # pixels of a preview's longer side
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A photo on the desk. id: of its file's bytes."""
+    """A photo on the desk. id: a hash of its file's bytes."""
 
     id: str
     name: str
@@ -42,13 +42,13 @@ class Shown:
     previewing: threading.Lock
 
     def lights(self, project: Project) -> list[Light]:
-        """The project's lights, drawn for this photo."""
+        """Return the project's lights, drawn for this photo."""
         return lights_of(project, self.file.size, self.painter)
 
 
 @dataclass(frozen=True)
 class Result:
-    """A full result. settings: what made it, for its metadata."""
+    """A full result. settings: those that made it, for its metadata."""
 
     photo: Photo
     settings: dict[str, Any]
@@ -56,13 +56,13 @@ class Result:
 
 
 class Newest:
-    """Numbers of requests by the pages that sent them: whether a newer one has come since."""
+    """The latest request number of each page, which shows whether a newer request has come."""
 
     def __init__(self) -> None:
         self._last: dict[str, int] = {}
 
     def note(self, page: str, number: int) -> Callable[[], bool]:
-        """Note a request; the function tells whether it is still the newest of its page."""
+        """Record a request. Returns a function that reports whether it is still the latest of its page."""
         self._last[page] = max(number, self._last.get(page, number))
         while len(self._last) > 64:
             del self._last[next(iter(self._last))]
@@ -70,10 +70,13 @@ class Newest:
 
 
 class Studio:
-    """The model, which loads while the page opens; photos; the queue of full results."""
+    """The model, which loads while the page opens; the photos; and the queue of full results."""
 
     def __init__(self, load: Callable[[], Relighter], folder: Path) -> None:
-        """load: makes the model. folder: for files that are gone when the desk closes."""
+        """Start to load the model.
+
+        load: makes it. folder: for files that are deleted when the desk closes.
+        """
         self.folder = folder
         self.queue = Queue()
         self.newest = Newest()
@@ -84,7 +87,7 @@ class Studio:
 
     @property
     def relighter(self) -> Relighter:
-        """The model, once it is loaded. Raises what its loading raised."""
+        """Return the model once it is loaded. Raises the error of its loading."""
         return self._loading.result()
 
     @property
@@ -121,7 +124,7 @@ class Studio:
         return shown
 
     def photo(self, name: str) -> Shown | None:
-        """A photo by its id, or None where it is not on the desk (any more)."""
+        """Return a photo by its id, or None where it is not, or no longer, on the desk."""
         with self._lock:
             if name in self._photos:
                 self._photos.move_to_end(name)
@@ -130,9 +133,9 @@ class Studio:
     def preview(
         self, shown: Shown, project: Project, longest: int, is_newest: Callable[[], bool]
     ) -> tuple[bytes, str | None]:
-        """A small JPEG of the photo under the lights, and what the person should know.
+        """Return a small JPEG of the photo under the lights, and a notice for the user.
 
-        Raises Cancelled as soon as a newer preview was asked for.
+        Raises Cancelled as soon as a newer preview is requested.
         """
         with shown.previewing:
             if not is_newest():
@@ -147,11 +150,11 @@ class Studio:
         return encode_jpeg(np.asarray(relit.picture), shown.file), relit.notice
 
     def target(self, shown: Shown, project: Project) -> Strokes:
-        """What the lights ask for, on the light grid."""
+        """Return the light that the lights ask for, on the light grid."""
         return shown.open.target_map(shown.lights(project), intensity=project.settings.intensity)
 
     def relight(self, shown: Shown, project: Project) -> Job | None:
-        """Queue a full result; None where the queue is full."""
+        """Queue a full result and return its job, or None where the queue is full."""
 
         def work(job: Job) -> Result:
             settings = project.settings
@@ -169,7 +172,7 @@ class Studio:
         return self.queue.submit(work)
 
     def export(self, result: Result, suffix: str) -> bytes:
-        """The file that `dior-rt relight` would write. suffix: ".png" and so on. Raises InputError."""
+        """Return the file that `dior-rt relight` would write. suffix: such as ".png". Raises InputError."""
         path = self.folder / f"{threading.get_ident()}{suffix}"
         try:
             write_photo(path, result.photo, result.settings)
@@ -179,8 +182,8 @@ class Studio:
 
 
 def encode_jpeg(pixels: NDArray, photo: Photo) -> bytes:
-    """A picture for the page, with the profile of the photo that it shows."""
-    # A profile with another curve than sRGB's would not fit these pixels.
+    """Return a picture for the page as a JPEG, with the profile of the photo that it shows."""
+    # A profile whose curve differs from sRGB's would not fit these pixels.
     profile = {} if photo.curves else {"icc_profile": photo.icc}
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "JPEG", quality=QUALITY, subsampling=0, **profile)
@@ -188,7 +191,7 @@ def encode_jpeg(pixels: NDArray, photo: Photo) -> bytes:
 
 
 def shrink(photo: Photo, longest: int) -> NDArray[np.uint8]:
-    """A photo's pixels for the page: uint8, at most `longest` a side."""
+    """Return a photo's pixels for the page: uint8, at most `longest` per side."""
     image = Image.fromarray(to_8_bits(photo.pixels))
     image.thumbnail((longest, longest), Image.Resampling.BOX, reducing_gap=2.0)
     return np.asarray(image)

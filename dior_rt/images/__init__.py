@@ -1,1 +1,1 @@
-"""Files in and out: photos with their colour profiles and metadata, strokes, Lumi maps, and arrays."""
+"""Read and write photos with their colour profiles and metadata, strokes, Lumi maps, and arrays."""

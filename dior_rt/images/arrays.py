@@ -1,4 +1,6 @@
-"""Photos and strokes in memory: arrays and Pillow images to the arrays that the kernels take, and back."""
+"""Photos and strokes in memory: convert arrays and Pillow images to the arrays that the kernels take, and
+back.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from dior_rt.kernels import NumpyOps, Stroke, Strokes
 
 Picture = Image.Image | NDArray
 
-#: Times white, of a float photo: what is brighter, float32 cannot take down to what a display shows.
+#: The largest value of a float photo, as a multiple of white. float32 cannot represent the step from brighter
+#: values down to what a display shows.
 BRIGHTEST = 16
 
 SHAPE_TOLERANCE = (
@@ -26,7 +29,7 @@ SHAPE_TOLERANCE = (
 
 
 def read_pixels(photo: Picture) -> NDArray:
-    """The photo's (H, W, 3) pixels, upright and on the sRGB curve, without alpha. Raises InputError.
+    """Return the photo's (H, W, 3) pixels, upright and on the sRGB curve, without alpha. Raises InputError.
 
     A Pillow image is read as its file would be: by its EXIF orientation and its colour profile.
     """
@@ -41,7 +44,7 @@ def read_pixels(photo: Picture) -> NDArray:
 
 
 def to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
-    """A photo's pixels for the eye: uint8, clipped at display white."""
+    """Return a photo's pixels for viewing: uint8, clipped at display white."""
     if pixels.dtype == np.uint8:
         return pixels
     if pixels.dtype == np.uint16:
@@ -50,24 +53,26 @@ def to_8_bits(pixels: NDArray) -> NDArray[np.uint8]:
 
 
 def like_photo(pixels: NDArray, photo: Picture) -> Picture:
-    """The pixels as the photo's kind: a Pillow image gets the photo's alpha, and its ICC and EXIF data."""
+    """Return the pixels as the photo's kind: a Pillow image gets the photo's alpha, and its ICC and EXIF
+    data.
+    """
     return image_of(photo_of(photo), pixels) if isinstance(photo, Image.Image) else pixels
 
 
 def primaries_of(photo: Picture) -> Matrix:
-    """The primaries that a Pillow image's profile names; those of sRGB for an array."""
+    """Return the primaries that a Pillow image's profile names, or those of sRGB for an array."""
     return photo_of(photo).primaries if isinstance(photo, Image.Image) else srgb()
 
 
 def in_primaries_of(photo: Picture, strokes: Any) -> Any:
-    """Strokes of any kind with their light in the primaries of a photo, which a Pillow image may name."""
+    """Return strokes of any kind with their light in a photo's primaries, which a Pillow image may name."""
     return to_primaries(strokes, primaries_of(photo))
 
 
 def to_primaries(strokes: Any, target: Matrix) -> Any:
-    """Strokes of any kind with their light in the target's primaries.
+    """Return strokes of any kind with their light in the target's primaries.
 
-    Arrays, Strokes and Stroke have those of sRGB; a Pillow image of strokes has its own profile's.
+    Arrays, Strokes and Stroke use the primaries of sRGB. A Pillow image of strokes uses those of its profile.
     """
     if isinstance(strokes, Image.Image):
         _check_8_bit(strokes)
@@ -84,7 +89,7 @@ def to_primaries(strokes: Any, target: Matrix) -> Any:
 
 
 def convert_strokes(strokes: Sequence[Stroke], matrix: Matrix | None) -> list[Stroke]:
-    """Strokes whose light is converted by a matrix of `primaries.conversion`."""
+    """Return the strokes with their light converted by a matrix of `primaries.conversion`."""
     if matrix is None:
         return list(strokes)
     converted = []
@@ -95,7 +100,7 @@ def convert_strokes(strokes: Sequence[Stroke], matrix: Matrix | None) -> list[St
 
 
 def convert_raster(raster: NDArray, matrix: Matrix | None) -> NDArray:
-    """(H, W, 4) light and mask, whose light is converted; it is float32 and linear then."""
+    """Return the (H, W, 4) light and mask with the light converted. The result is float32 and linear."""
     if matrix is None:
         return raster
     light, mask = raster[..., :3], raster[..., 3]
@@ -106,9 +111,9 @@ def convert_raster(raster: NDArray, matrix: Matrix | None) -> NDArray:
 
 
 def read_strokes(strokes: Strokes | Picture) -> tuple[NDArray, NDArray]:
-    """The strokes' light (H, W, 3) and mask (H, W). Raises InputError.
+    """Return the strokes' light (H, W, 3) and mask (H, W). Raises InputError.
 
-    RGBA pictures: alpha is the mask; integers are sRGB-encoded, floats are linear.
+    In an RGBA picture, alpha is the mask. Integers are sRGB-encoded, and floats are linear.
     """
     if isinstance(strokes, Strokes):
         light, mask = np.asarray(strokes.light, np.float32), np.asarray(strokes.mask, np.float32)
@@ -127,7 +132,7 @@ def read_strokes(strokes: Strokes | Picture) -> tuple[NDArray, NDArray]:
 
 
 def check_same_shape(strokes: tuple[int, ...], photo: tuple[int, ...]) -> None:
-    """InputError unless two (rows, columns) are the same shape, whatever their size."""
+    """Raise InputError unless two (rows, columns) have the same aspect ratio, whatever their size."""
     (h, w), (rows, columns) = strokes, photo
     apart = [(w, h * columns / rows), (h, w * rows / columns)]
     if not any(abs(side - wanted) <= max(1, SHAPE_TOLERANCE * wanted) for side, wanted in apart):

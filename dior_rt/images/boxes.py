@@ -1,6 +1,7 @@
-"""What the boxes of an AVIF or a JPEG 2000 file say of depth and colour, which Pillow does not pass on.
+"""Read depth and colour from the boxes of an AVIF or a JPEG 2000 file. Pillow does not pass these on.
 
-ISO 14496-12 (boxes), 23000-22 (colr, nclx), AV1-ISOBMFF (av1C); ITU-T T.800 annex I (ihdr, colr).
+The boxes are specified in ISO 14496-12 (boxes), 23000-22 (colr, nclx), AV1-ISOBMFF (av1C), and ITU-T T.800
+annex I (ihdr, colr).
 """
 
 from __future__ import annotations
@@ -16,7 +17,11 @@ MOST_BYTES = 16 << 20
 
 @dataclass(frozen=True)
 class BoxFacts:
-    """bits: of a channel, 0 where unknown. cicp: primaries, transfer and matrix of ITU-T H.273. icc: b""."""
+    """The facts that the boxes state.
+
+    bits: the bits of a channel, 0 where unknown. cicp: primaries, transfer and matrix of ITU-T H.273. icc:
+    the profile, b"" where there is none.
+    """
 
     bits: int = 0
     cicp: tuple[int, int, int] | None = None
@@ -24,7 +29,7 @@ class BoxFacts:
 
 
 def read_boxes(file: IO[bytes]) -> BoxFacts:
-    """The facts of an AVIF or JPEG 2000 file; what is damaged is left out."""
+    """Return the facts of an AVIF or JPEG 2000 file. Damaged boxes are left out."""
     file.seek(0)
     head = file.read(12)
     if head.startswith(b"\xff\x4f\xff\x51"):  # a bare JPEG 2000 codestream: its size marker comes first
@@ -46,7 +51,7 @@ def read_boxes(file: IO[bytes]) -> BoxFacts:
 
 
 def _codestream_bits(head: bytes) -> int:
-    """Bits of the first component by the SIZ marker, which stands first."""
+    """Return the bits of the first component from the SIZ marker, which comes first."""
     return (head[42] & 127) + 1 if len(head) > 42 else 0
 
 

@@ -1,4 +1,4 @@
-"""Camera raw files, known by their first bytes: their pictures have to be developed before they are relit."""
+"""Recognise camera raw files by their first bytes. Their pictures must be developed before they are relit."""
 
 from __future__ import annotations
 
@@ -23,5 +23,8 @@ _MAGIC = (
 
 
 def is_raw(head: bytes) -> bool:
-    """Whether a file that begins like this is a camera's raw file; a DNG or NEF is told by its tags."""
+    """Return whether a file that begins like this is a camera's raw file.
+
+    DNG and NEF are recognised by their tags.
+    """
     return any(head[at : at + len(magic)] == magic for at, magic in _MAGIC)

@@ -1,4 +1,4 @@
-"""What the file around the pixels says: metadata, colour, depth, pages and place, format by format."""
+"""Read what the file around the pixels states, format by format: metadata, colour, depth, pages and place."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Facts:
-    """exif, xmp, iptc: as found. icc: the profile by which the pixels are read, b"" for sRGB. bits: a
-    channel's depth where the file has more than is read, else 0. offset, canvas: where a cut-out picture
-    lies, (right, down) on a canvas of (rows, columns), None where the file does not say. lossy: whether
-    packing changes pixels. turned: whether Pillow turns the picture upright itself, by EXIF. notices:
-    sentences.
+    """The facts that the file around the pixels states.
+
+    exif, xmp, iptc: as found. icc: the profile by which the pixels are read, b"" for sRGB. bits: a channel's
+    depth where the file has more than is read, else 0. offset, canvas: the place of a cut-out picture,
+    (right, down) on a canvas of (rows, columns), None where the file names none. lossy: whether packing
+    changes pixels. turned: whether Pillow turns the picture upright itself, by EXIF. notices: sentences for
+    the user.
     """
 
     exif: Exif = field(default_factory=Exif)
@@ -39,13 +41,13 @@ class Facts:
 
 
 def read_facts(file: IO[bytes], image: Image.Image, page: int = 0) -> Facts:
-    """The facts of an opened picture of Pillow's. Raises ValueError for HDR."""
+    """Return the facts of a picture that Pillow has opened. Raises ValueError for HDR."""
     reader = {"PNG": _png, "TIFF": _tiff, "AVIF": _boxed, "JPEG2000": _boxed}.get(image.format or "", _plain)
     return reader(file, image, page)
 
 
 def facts_of(image: Image.Image) -> Facts:
-    """The facts of a loaded picture in memory, as far as Pillow passes them on."""
+    """Return the facts of a loaded picture in memory, as far as Pillow passes them on."""
     info, is_tiff = image.info, image.format == "TIFF"
     exif = image.getexif().tobytes() if is_tiff else _bytes(info.get("exif"))
     icc = _bytes(info.get("icc_profile"))
@@ -76,7 +78,7 @@ def _png(file: IO[bytes], image: Image.Image, page: int) -> Facts:
     icc = _bytes(image.info.get("icc_profile"))
     notices: tuple[str, ...] = ()
     code = chunks.get(b"cICP", b"")
-    if len(code) == 4:  # it stands over a profile, and that over sRGB, gAMA and cHRM
+    if len(code) == 4:  # cICP overrides a profile, and a profile overrides sRGB, gAMA and cHRM
         icc = primaries.profile_of_codes(code[0], code[1])
     elif not icc and b"sRGB" not in chunks:
         try:

@@ -1,8 +1,8 @@
-"""TIFF directories, in which EXIF and TIFF files keep their tags: read and written value by value.
+"""Read and write TIFF directories value by value. EXIF and TIFF files keep their tags in them.
 
-Pillow's own reader forgets the types of the values, and a viewer rejects a UserComment of the wrong type.
-Here each value keeps its type and its bytes, in little-endian order. TIFF 6.0, section 2; BigTIFF,
-libtiff's design.
+Pillow's reader forgets the types of the values, and a viewer rejects a UserComment of the wrong type. Here
+each value keeps its type and its bytes, in little-endian order. TIFF 6.0, section 2; BigTIFF, libtiff's
+design.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ _CODES = {1: "B", 2: "B", 3: "H", 4: "I", 6: "b", 7: "B", 8: "h", 9: "i", 11: "f
 
 @dataclass(frozen=True)
 class Entry:
-    """One tag's value: its type, how many values there are, and their bytes in little-endian order."""
+    """One tag's value: its type, its number of values, and their bytes in little-endian order."""
 
     kind: int
     count: int
     data: bytes
 
     def numbers(self) -> tuple[float, ...]:
-        """The values as numbers; a rational becomes a float, and 0 where its denominator is 0."""
+        """Return the values as numbers. A rational becomes a float, or 0 where its denominator is 0."""
         if self.kind in (5, 10):
             pairs = struct.unpack(f"<{self.count * 2}{'I' if self.kind == 5 else 'i'}", self.data)
             return tuple(a / b if b else 0.0 for a, b in zip(pairs[::2], pairs[1::2], strict=True))
@@ -59,7 +59,7 @@ class Entry:
         return struct.unpack(f"<{self.count}{code}", self.data) if code else ()
 
     def text(self) -> str:
-        """The values as text, up to the first zero byte."""
+        """Return the values as text, up to the first zero byte."""
         return self.data.partition(b"\0")[0].decode("latin-1").strip()
 
 
@@ -67,13 +67,13 @@ Directory = dict[int, Entry]
 
 
 def number(directory: Mapping[int, Entry], tag: int, default: float = 0) -> float:
-    """The first value of a tag, or the default where the tag is missing or holds no number."""
+    """Return the first value of a tag, or the default where the tag is missing or holds no number."""
     values = directory[tag].numbers() if tag in directory else ()
     return values[0] if values else default
 
 
 def entry(kind: int, *values: int | float | bytes) -> Entry:
-    """An entry of whole numbers, rationals (given as floats), or bytes."""
+    """Return an entry of whole numbers, rationals (passed as floats), or bytes."""
     if isinstance(values[0], bytes):
         return Entry(kind, len(values[0]), values[0])
     if kind == RATIONAL:
@@ -85,8 +85,8 @@ def entry(kind: int, *values: int | float | bytes) -> Entry:
 class Reader:
     """The directories of one TIFF structure.
 
-    damaged: whether a value had to be left out because it lies outside the file or has no known type.
-    first: the offset of the first directory. big: whether it is a BigTIFF.
+    damaged: whether a value was left out because it lies outside the file or has an unknown type. first: the
+    offset of the first directory. big: whether the file is a BigTIFF.
     """
 
     def __init__(self, file: IO[bytes] | bytes) -> None:
@@ -105,7 +105,7 @@ class Reader:
             self.first = int(struct.unpack_from(self._order + "I", head, 4)[0])
 
     def directory(self, offset: int) -> tuple[Directory, int]:
-        """The directory at an offset, and the offset of the next one (0 for none).
+        """Return the directory at an offset, and the offset of the next one (0 for none).
 
         A directory outside the file is empty.
         """
@@ -159,7 +159,9 @@ class Reader:
 def pack(
     directory: Mapping[int, Entry], children: Mapping[int, Mapping[int, Entry]], start: int = 8
 ) -> bytes:
-    """A directory as it lies at the offset `start`, with the directories that some of its tags point at."""
+    """Return a directory as it lies at the offset `start`, with the directories that some of its tags point
+    at.
+    """
     pointers = {tag: Entry(LONG, 1, bytes(4)) for tag, child in children.items() if child}
     entries = dict(sorted({**directory, **pointers}.items()))
     at = start + 2 + 12 * len(entries) + 4

@@ -1,4 +1,4 @@
-"""OpenEXR files of linear light, by the format's own library."""
+"""Read and write OpenEXR files of linear light with the OpenEXR library."""
 
 from __future__ import annotations
 
@@ -21,29 +21,33 @@ from dior_rt.images.primaries import Matrix, srgb, to_xyz
 
 @dataclass(frozen=True)
 class ExrPicture:
-    """pixels: (H, W, 3 or 4) float32. primaries: of its RGB, as `primaries.to_xyz`."""
+    """A picture from an EXR file.
+
+    pixels: (H, W, 3 or 4) float32. primaries: those of its RGB, as `primaries.to_xyz`.
+    """
 
     pixels: NDArray[np.float32]
     primaries: Matrix
 
 
 def read_exr(path: Path, what: str) -> NDArray[np.float32]:
-    """The channels R, G, B and, where there is one, A of the first part as (H, W, 3 or 4) float32, unchanged.
+    """Return R, G, B and, where present, A of the first part as (H, W, 3 or 4) float32, unchanged.
 
-    The picture is the display window; what the data window leaves open is 0. what: how errors call the file.
-    Raises InputError for a file that is damaged, deep, of more than MOST_PIXELS, or without those channels.
+    The picture is the display window. Pixels outside the data window are 0. what: the name of the file in
+    errors. Raises InputError for a file that is damaged, deep, larger than MOST_PIXELS, or without those
+    channels.
     """
     return read_exr_picture(path, what).pixels
 
 
 def read_exr_picture(path: Path, what: str) -> ExrPicture:
-    """As `read_exr`, with the primaries that the header names; Rec. 709's where it names none."""
+    """Return the picture of `read_exr` with the primaries that the header names, or Rec. 709's by default."""
     import OpenEXR
 
     check_readable(path, what)
     try:
         with _hushed():
-            # The header first: a few bytes can promise a picture of any size.
+            # Check the header first, because a few bytes can promise a picture of any size.
             header = OpenEXR.File(str(path), header_only=True).header()
             if header.get("type") in (OpenEXR.deepscanline, OpenEXR.deeptile):
                 raise ValueError("it is a deep EXR, with many samples a pixel; flatten it first")
@@ -72,8 +76,8 @@ def _primaries(header: dict[str, Any]) -> Matrix:
 def write_exr(path: Path, light: NDArray[Any], texts: Mapping[str, str] | None = None) -> None:
     """Write (H, W, 3 or 4) linear light, float32 or float16, as R, G, B and A, whole or not at all.
 
-    The colours of a picture with A are multiplied by it, as EXR has it. texts: attributes of the
-    header. Raises InputError.
+    The colours of a picture with A are multiplied by A, as EXR requires. texts: attributes of the header.
+    Raises InputError.
     """
     import OpenEXR
 
@@ -95,7 +99,7 @@ def _box(window: Any) -> Box:
 
 
 def _frame(data: NDArray[np.float32], shown: Box, stored: Box) -> NDArray[np.float32]:
-    """The part of the stored box that is shown, in a picture of the shown box's size."""
+    """Return the part of the stored box that is shown, in a picture of the shown box's size."""
     picture = np.zeros((shown[3], shown[2], data.shape[2]), np.float32)
     left, top = max(shown[0], stored[0]), max(shown[1], stored[1])
     right, bottom = (
@@ -110,10 +114,10 @@ def _frame(data: NDArray[np.float32], shown: Box, stored: Box) -> NDArray[np.flo
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Keep off the terminal what the library prints beside raising: C to stderr, Python to stdout."""
+    """Suppress what the library prints when it raises: C code to stderr, Python code to stdout."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
-        with contextlib.suppress(OSError):  # a stream that is closed says nothing anyway
+        with contextlib.suppress(OSError):  # a closed stream prints nothing
             saved = os.dup(2)
             stack.callback(os.close, saved)
             stack.callback(os.dup2, saved, 2)

@@ -1,7 +1,7 @@
 """OpenEXR pictures as photos: scene-linear light in floating point, in which highlights exceed white.
 
-The pixels are put on sRGB's curve, continued above 1, and taken back when an EXR is written. In other formats
-light ends at display white.
+Reading puts the pixels on sRGB's curve, continued above 1. Writing an EXR takes them back to linear light. In
+other formats light ends at display white.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from dior_rt.images.photo import Photo
 from dior_rt.images.primaries import conversion, convert, srgb
 from dior_rt.kernels.color import linear_to_srgb, srgb_to_linear
 
-#: Times white, linear: what a float photo holds.
+#: The largest linear value that a float photo holds, as a multiple of white.
 MOST_LIGHT: Final = float(srgb_to_linear(np.float64(BRIGHTEST)))
 
 
 def read(path: Path) -> Photo:
-    """Read the first part; its colours come in sRGB's primaries. Raises InputError."""
+    """Read the first part, with its colours in sRGB's primaries. Raises InputError."""
     picture = read_exr_picture(path, "photo")
     light, notices = picture.pixels[..., :3], []
     broken = np.asarray(~np.isfinite(light).all(axis=-1))
@@ -48,12 +48,12 @@ def read(path: Path) -> Photo:
 
 
 def encode(light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear light >= 0 -> sRGB's curve, continued above 1."""
+    """Return linear light >= 0 encoded by sRGB's curve, continued above 1."""
     return np.minimum(linear_to_srgb(light), BRIGHTEST).astype(np.float32)
 
 
 def to_light(photo: Photo) -> NDArray[np.float32]:
-    """The photo as an EXR has it: (H, W, 3 or 4) linear light, multiplied by its alpha."""
+    """Return the photo as an EXR stores it: (H, W, 3 or 4) linear light, multiplied by its alpha."""
     pixels, alpha = photo.pixels, photo.alpha
     if pixels.dtype != np.float32:
         pixels = pixels / np.iinfo(pixels.dtype).max

@@ -1,7 +1,7 @@
-"""HEIC and HEIF: 8, 10 and 12 bits, with their profile, EXIF and XMP, by pillow-heif (extra [heic]).
+"""Read HEIC and HEIF of 8, 10 and 12 bits, with profile, EXIF and XMP, by pillow-heif (extra [heic]).
 
-The library turns the picture as its container says, which is the rule for such files; EXIF's orientation is
-not carried out once more.
+The library turns the picture as its container states, which is the rule for such files. EXIF's orientation is
+not applied a second time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GAIN_MAP = "It has an HDR gain map, which belongs to the photo's old light; it i
 
 
 def read(path: Path) -> Photo:
-    """Read the primary picture. Raises ValueError, and what the library raises for a damaged file."""
+    """Read the primary picture. Raises ValueError, and the library's errors for a damaged file."""
     container = pillow_heif.open_heif(path, convert_hdr_to_8bit=False)
     image = container[container.primary_index]
     width, height = image.size
@@ -53,7 +53,7 @@ def read(path: Path) -> Photo:
 
 
 def _profile(info: dict[str, Any]) -> bytes:
-    """The profile that the container's colour codes stand for. Raises ValueError for HDR."""
+    """Return the profile that the container's colour codes stand for. Raises ValueError for HDR."""
     codes = info.get("nclx_profile")
     return profile_of_codes(codes["color_primaries"], codes["transfer_characteristics"]) if codes else b""
 

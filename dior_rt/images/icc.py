@@ -1,10 +1,10 @@
-"""ICC profiles: how a photo's numbers become light, and how its curve is exchanged for that of sRGB.
+"""ICC profiles: convert a photo's numbers to light, and exchange its curve for that of sRGB.
 
-Everything that computes light here expects the sRGB curve. A photo with RGB primaries of its own (Display P3,
-Adobe RGB, ProPhoto ...) keeps them: only its curve is exchanged, and exchanged back when it is written. So no
-colour is clipped to sRGB's gamut, light is still added and scaled linearly, and a pixel whose light does not
-change comes out as it went in. Colours in a photo without such curves (CMYK, scanner tables) are converted to
-sRGB by LittleCMS.
+All code here that computes light expects the sRGB curve. A photo with other RGB primaries (Display P3, Adobe
+RGB, ProPhoto ...) keeps them. Only its curve is exchanged, and it is exchanged back when the photo is
+written. So no colour is clipped to sRGB's gamut, light is still added and scaled linearly, and a pixel whose
+light does not change comes out unchanged. LittleCMS converts the colours of a photo without such curves
+(CMYK, scanner tables) to sRGB.
 
 ICC.1:2022 (profile version 4.4): section 7 for the tag table, 10.6 curveType, 10.18 parametricCurveType.
 """
@@ -28,31 +28,34 @@ Pixels = NDArray[Any]  # uint8 or uint16
 
 @dataclass(frozen=True)
 class Curves:
-    """A photo's own curves: `srgb[c, k]` is what code k of channel c is when sRGB-encoded, 0..1.
+    """The curves of a photo: `srgb[c, k]` is code k of channel c, sRGB-encoded, 0..1.
 
-    There are 256 or 65,536 codes and 3 channels (1 for a grey photo); every row rises.
+    There are 256 or 65,536 codes and 3 channels (1 for a grey photo). Every row rises.
     """
 
     srgb: NDArray[np.float64]
 
     @property
     def is_srgb(self) -> bool:
-        """Whether the curves are sRGB's own, to half a step of 8 bits; then the numbers are left alone."""
+        """Return whether the curves equal sRGB's to half a step of 8 bits.
+
+        The numbers are then left alone.
+        """
         codes = np.linspace(0, 1, self.srgb.shape[1])
         return bool(np.abs(self.srgb - codes).max() <= 0.5 / 255)
 
     def with_codes(self, codes: int) -> Curves:
-        """The same curves at another number of codes, by straight lines."""
+        """Return the same curves at another number of codes, interpolated linearly."""
         x = np.linspace(0, 1, self.srgb.shape[1])
         return Curves(np.stack([np.interp(np.linspace(0, 1, codes), x, row) for row in self.srgb]))
 
     def to_srgb(self, pixels: Pixels) -> NDArray[np.uint16]:
-        """(H, W, channels) in the photo's own encoding -> uint16, sRGB-encoded."""
+        """Convert (H, W, channels) from the photo's encoding to uint16, sRGB-encoded."""
         tables = np.round(self.srgb * 65535).astype(np.uint16)
         return np.stack([table[pixels[..., c]] for c, table in enumerate(tables)], axis=-1)
 
     def from_srgb(self, pixels: NDArray[np.uint16]) -> Pixels:
-        """The way back, to the nearest code: undoes `to_srgb` exactly where the photo has 8 bits."""
+        """Convert back to the nearest code. This undoes `to_srgb` exactly where the photo has 8 bits."""
         top = self.srgb.shape[1] - 1
         dtype = np.uint8 if top == 255 else np.uint16
         tables = [np.interp(np.arange(65536) / 65535, row, np.arange(top + 1)) for row in self.srgb]
@@ -62,7 +65,9 @@ class Curves:
 
 @dataclass(frozen=True)
 class Coloured:
-    """Pixels (H, W, 3) on the sRGB curve, what takes them back, the profile to write, what was lost."""
+    """Pixels (H, W, 3) on the sRGB curve, the curves that take them back, the profile to write, and notices
+    of losses.
+    """
 
     pixels: Pixels
     curves: Curves | None = None
@@ -73,7 +78,7 @@ class Coloured:
 def interpret(samples: Pixels, icc: bytes) -> Coloured:
     """Put (H, W, 1 or 3) grey or RGB samples with their ICC profile (b"" for none: sRGB) on the sRGB curve.
 
-    Grey becomes RGB, since the light that falls on it may have a colour. A profile that cannot be used is
+    Grey becomes RGB, because the light that falls on it may have a colour. A profile that cannot be used is
     left out, with a notice.
     """
     top = int(np.iinfo(samples.dtype).max)
@@ -100,7 +105,7 @@ def interpret(samples: Pixels, icc: bytes) -> Coloured:
 
 
 def read_primaries(icc: bytes) -> NDArray[np.float64] | None:
-    """(3, 3) linear RGB -> XYZ under D50 of an RGB profile made of primaries and curves; else None."""
+    """Return (3, 3), linear RGB -> XYZ under D50, for an RGB profile of primaries and curves, else None."""
     try:
         tags = _tags(icc)
         if icc[16:20] != b"RGB " or b"A2B0" in tags:
@@ -113,7 +118,9 @@ def read_primaries(icc: bytes) -> NDArray[np.float64] | None:
 
 
 def convert_to_srgb(image: Image.Image, icc: bytes) -> Image.Image:
-    """An 8-bit picture and its ICC profile -> sRGB, relative colorimetric, black point compensated."""
+    """Convert an 8-bit picture by its ICC profile to sRGB, relative colorimetric, with black point
+    compensation.
+    """
     converted = ImageCms.profileToProfile(
         image,
         ImageCms.ImageCmsProfile(io.BytesIO(icc)),
@@ -128,13 +135,13 @@ def convert_to_srgb(image: Image.Image, icc: bytes) -> Image.Image:
 
 @cache
 def srgb_profile() -> bytes:
-    """An ICC profile of sRGB."""
+    """Return an ICC profile of sRGB."""
     return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
 
 
 def _by_tables(samples: Pixels, icc: bytes) -> Coloured:
     notices: tuple[str, ...] = ()
-    if samples.dtype == np.uint16:  # LittleCMS is reached through Pillow, whose colours have 8 bits
+    if samples.dtype == np.uint16:  # Pillow gives access to LittleCMS, and its colours have 8 bits
         samples = np.round(samples / 257).astype(np.uint8)
         notices = ("Its colour profile is made of tables, so it is converted to 8-bit sRGB.",)
     image = convert_to_srgb(Image.fromarray(samples.squeeze()), icc)
@@ -142,14 +149,14 @@ def _by_tables(samples: Pixels, icc: bytes) -> Coloured:
 
 
 def read_curves(icc: bytes, codes: int) -> Curves | None:
-    """The curves of an RGB or grey ICC profile at `codes` even points; None where it is not made of curves.
+    """Return an RGB or grey profile's curves at `codes` even points, or None where it is not made of curves.
 
     Raises ValueError for a damaged profile.
     """
     try:
         tags = _tags(icc)
         names = {b"RGB ": (b"rTRC", b"gTRC", b"bTRC"), b"GRAY": (b"kTRC",)}.get(icc[16:20])
-        # With an A2B table a colour engine ignores the curves, and so must we.
+        # A colour engine ignores the curves where there is an A2B table, so this reader must, too.
         if names is None or b"A2B0" in tags or any(name not in tags for name in names):
             return None
         x = np.linspace(0, 1, codes)
@@ -160,7 +167,8 @@ def read_curves(icc: bytes, codes: int) -> Curves | None:
         return None
     srgb = linear_to_srgb(np.clip(linear, 0, 1))
     if codes == 256:
-        # Codes of the same light, as a coarse table has them near black, stay apart by two steps of 16 bits.
+        # A coarse table maps several codes near black to the same light. Two steps of 16 bits keep them
+        # apart.
         ramp = np.arange(codes) * 2 / 65535
         srgb = np.maximum.accumulate(srgb - ramp, axis=1) + ramp
     return Curves(srgb / np.maximum(srgb[:, -1:], 1))
@@ -175,7 +183,7 @@ def _tags(icc: bytes) -> dict[bytes, bytes]:
 
 
 def _curve(tag: bytes, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Linear light 0..1 of the encoded values x by a curveType or parametricCurveType tag."""
+    """Return the linear light 0..1 of the encoded values x by a curveType or parametricCurveType tag."""
     if tag[:4] == b"curv":
         (count,) = struct.unpack_from(">I", tag, 8)
         values = np.array(struct.unpack_from(f">{count}H", tag, 12), np.float64)
@@ -193,7 +201,10 @@ def _curve(tag: bytes, x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _parametric(kind: int, p: list[float], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Y = (a X + b)^g + e for X >= d, and c X + f below; table 68 of ICC.1:2022 says which are given."""
+    """Return Y = (a X + b)^g + e for X >= d, and c X + f below.
+
+    Table 68 of ICC.1:2022 lists which are present.
+    """
     g = p[0]
     a, b = (p[1], p[2]) if kind > 0 else (1.0, 0.0)
     c = p[3] if kind >= 3 else 0.0

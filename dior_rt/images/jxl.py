@@ -1,4 +1,4 @@
-"""JPEG XL in and out, 8 and 16 bits with the profile, by OpenImageIO (extra [jxl])."""
+"""Read and write JPEG XL of 8 and 16 bits with the profile, by OpenImageIO (extra [jxl])."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def read(path: Path) -> Photo:
 
 
 def write(path: Path, samples: NDArray, icc: bytes, quality: int | None) -> None:
-    """Write (H, W, 3 or 4) uint8 or uint16 samples; quality 100, or None, keeps them exactly.
+    """Write (H, W, 3 or 4) uint8 or uint16 samples. Quality 100 or None keeps them exactly.
 
-    Raises ValueError where that fails.
+    Raises ValueError where writing fails.
     """
     height, width, channels = samples.shape
     spec = OpenImageIO.ImageSpec(width, height, channels, samples.dtype.name)

@@ -1,8 +1,8 @@
-"""What a picture says about itself: EXIF, XMP and IPTC carried over, and the settings that made the result.
+"""Carry over a picture's EXIF, XMP and IPTC, and write the settings that made the result.
 
-EXIF keeps what stays true of the relit photo. Left out are the orientation (carried out), sizes and thumbnail
-(stale), and the maker's note (its inner offsets break when it is moved). The settings stand in XMP, and in a
-PNG also as text; the photographer's own UserComment is left alone.
+EXIF keeps the tags that remain true of the relit photo. It drops the orientation (already applied), sizes and
+thumbnail (stale), and the maker's note (its inner offsets break when it is moved). The settings are stored in
+XMP, and in a PNG also as text. The photographer's UserComment is left alone.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dior_rt.files import check_readable
 from dior_rt.images import xmp
 from dior_rt.images.directories import HEADER, UNDEFINED, Directory, Entry, Reader, number, pack
 
-#: What a damaged file makes Pillow raise, here and there.
+#: The errors that Pillow may raise for a damaged file.
 DAMAGE = (
     OSError,
     ValueError,
@@ -59,7 +59,7 @@ _KEPT = {
     Base.XPSubject,
 }
 _STALE = {Base.MakerNote, Base.ExifInteroperabilityOffset, Base.ExifImageWidth, Base.ExifImageHeight}
-#: Tags that EXIF defines as UNDEFINED, but some programs (Pillow among them) write as BYTE.
+#: Tags that EXIF defines as UNDEFINED, but that some programs (such as Pillow) write as BYTE.
 _UNDEFINED = {36864, 37121, 37500, 37510, 40960, 41728, 41729, 41730, 27, 28}
 _UNCALIBRATED = 65535
 _HEAD = b"Exif\0\0"
@@ -77,19 +77,21 @@ class Exif:
 
     @property
     def orientation(self) -> int:
-        """1 to 8, as the picture must be turned to stand upright; 1 where nothing sensible is said."""
+        """Return how to turn the picture upright, 1 to 8, or 1 where the tag makes no sense."""
         value = number(self.main, Base.Orientation, 1)
         return int(value) if value in range(1, 9) else 1
 
     @property
     def is_adobe_rgb(self) -> bool:
-        """Whether the camera says Adobe RGB by DCF's mark "R03", the only one that has no ICC profile."""
+        """Return whether DCF's mark "R03" states Adobe RGB, the only such mark that comes without an ICC
+        profile.
+        """
         space = number(self.camera, Base.ColorSpace, _UNCALIBRATED)
         mark = self.interoperability.get(1)
         return space == _UNCALIBRATED and mark is not None and mark.text() == "R03"
 
     def kept(self) -> bytes:
-        """The part that stays true of the relit photo, as it is written; b"" for none."""
+        """Return the part that remains true of the relit photo, as bytes to write, or b"" for none."""
         main = {tag: value for tag, value in self.main.items() if tag in _KEPT}
         camera = {tag: _typed(tag, value) for tag, value in self.camera.items() if tag not in _STALE}
         place = {tag: _typed(tag, value) for tag, value in self.place.items()}
@@ -99,7 +101,7 @@ class Exif:
 
 
 def read_exif(data: bytes) -> Exif:
-    """EXIF from the bytes that a JPEG, PNG, WebP or AVIF holds; damaged parts are left out."""
+    """Return the EXIF in the bytes that a JPEG, PNG, WebP or AVIF holds. Damaged parts are left out."""
     if not data:
         return Exif()
     try:
@@ -109,7 +111,7 @@ def read_exif(data: bytes) -> Exif:
 
 
 def exif_of(reader: Reader, offset: int | None = None) -> Exif:
-    """EXIF from the directory at an offset, the first one where none is named."""
+    """Return the EXIF of the directory at an offset, or of the first directory where none is named."""
     main, _ = reader.directory(reader.first if offset is None else offset)
     found = []
     for directory, pointer in ((main, IFD.Exif), (main, IFD.GPSInfo)):
@@ -122,7 +124,9 @@ def exif_of(reader: Reader, offset: int | None = None) -> Exif:
 
 
 def directories_of(exif: bytes) -> tuple[Directory, dict[int, Directory]]:
-    """Written EXIF as a TIFF takes it: the main directory, and the others by the tag that points at them."""
+    """Return the directories of written EXIF for a TIFF: the main one, and the others by the tag that points
+    at them.
+    """
     parts = read_exif(exif)
     main = {tag: value for tag, value in parts.main.items() if tag not in (IFD.Exif, IFD.GPSInfo)}
     return main, {IFD.Exif: parts.camera, IFD.GPSInfo: parts.place}
@@ -133,14 +137,14 @@ def _typed(tag: int, value: Entry) -> Entry:
 
 
 def photoshop_block(iptc: bytes) -> bytes:
-    """The JPEG segment (APP13) that holds IPTC."""
+    """Return the JPEG segment (APP13) that holds IPTC."""
     block = b"8BIM" + struct.pack(">HHI", IPTC, 0, len(iptc)) + iptc + bytes(len(iptc) % 2)
     data = b"Photoshop 3.0\0" + block
     return b"\xff\xed" + struct.pack(">H", len(data) + 2) + data
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """The settings in a picture that was written here; InputError where there are none."""
+    """Return the settings in a picture that this program wrote. Raises InputError where there are none."""
     check_readable(path, "picture")
     try:
         with Image.open(path) as image:
@@ -155,7 +159,9 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def read_dpi(info: Mapping[Any, Any]) -> tuple[float, float] | None:
-    """Dots an inch across and down by Pillow's info; None where they are not given or make no sense."""
+    """Return dots per inch across and down from Pillow's info, or None where they are missing or make no
+    sense.
+    """
     try:
         across, down = (float(value) for value in info["dpi"])
     except (KeyError, ValueError, TypeError, ArithmeticError):

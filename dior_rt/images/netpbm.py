@@ -1,4 +1,4 @@
-"""PGM and PPM of more than 8 bits, of which Pillow keeps 8. https://netpbm.sourceforge.net/doc/ppm.html"""
+"""Read PGM and PPM of more than 8 bits; Pillow keeps only 8. https://netpbm.sourceforge.net/doc/ppm.html"""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _HEADER = re.compile(rb"P([2356])(?:\s+|#[^\n]*\n)+(\d+)(?:\s+|#[^\n]*\n)+(\d+)(
 
 
 def is_deep_netpbm(head: bytes) -> bool:
-    """Whether a file that begins like this is a PGM or PPM with samples above 255."""
+    """Return whether a file that begins like this is a PGM or PPM with samples above 255."""
     found = _HEADER.match(head)
     return found is not None and int(found[4]) > 255
 
 
 def read_netpbm(file: IO[bytes]) -> NDArray[np.uint16]:
-    """(H, W, 1 or 3) samples, stretched to 0..65535 where the file's white is another. Raises ValueError."""
+    """Return (H, W, 1 or 3) samples, scaled to 0..65535 where the file's white differs. Raises ValueError."""
     file.seek(0)
     data = file.read()
     found = _HEADER.match(data)

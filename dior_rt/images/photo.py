@@ -1,4 +1,4 @@
-"""Photos in and out of files: orientation, depth, colour, transparency and metadata survive the way through.
+"""Read and write photos: orientation, depth, colour, transparency and metadata are preserved.
 
 In: PNG, JPEG (MPO too), TIFF, WebP, GIF, BMP, JPEG 2000, AVIF, PPM and flat Photoshop documents, and what
 `readers` adds: EXR, HEIC, JPEG XL and camera raw. Out: PNG, JPEG, TIFF, WebP, EXR and JPEG XL, by the file's
@@ -57,7 +57,7 @@ from dior_rt.images.readers import MissingReader, find_reader
 from dior_rt.images.sixteen_bit import STRATEGY, is_deep, read_deep, write_png, write_tiff
 from dior_rt.images.tiff_pages import read_facts as read_tiff_facts
 
-#: Larger pictures are refused by their header, before they are decoded; Pillow, as it comes, agrees.
+#: Larger pictures are refused by their header, before they are decoded. Pillow's default limit agrees.
 MOST_PIXELS = 178_956_970
 
 _READABLE = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "JPEG2000", "AVIF", "PPM", "PSD")
@@ -79,7 +79,7 @@ _SAVE: dict[str, dict[str, Any]] = {
     "WEBP": {"quality": 95, "exact": True},
 }
 
-# EXIF's orientations but the first, each as what makes the picture stand upright.
+# EXIF's orientations except the first, each as the operation that turns the picture upright.
 _UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: np.fliplr,
     3: partial(np.rot90, k=2),
@@ -96,12 +96,11 @@ class Photo:
     """A photo as it is seen, upright.
 
     pixels: (H, W, 3) uint8 or uint16 on the sRGB curve, in the photo's own primaries; or float32 on that
-    curve, continued above 1 (see `exr_photo`). alpha: (H, W) of the
-    file's depth, or None. curves: what the pixels are taken back to when written, where that is not sRGB's
-    curve. icc, exif, xmp, iptc: as they are written, b"" for none. dpi: dots an inch across and down, or
-    None. notices: sentences about what could not be kept. offset, canvas: where a cut-out picture lies,
-    (right, down) on a canvas of (rows, columns), None where the file does not say. lossy: whether packing
-    changed the pixels.
+    curve, continued above 1 (see `exr_photo`). alpha: (H, W) at the file's depth, or None. curves: the curves
+    that the pixels are taken back to when written, where they differ from sRGB's. icc, exif, xmp, iptc: the
+    bytes to write, b"" for none. dpi: dots per inch across and down, or None. notices: sentences about what
+    could not be kept. offset, canvas: the place of a cut-out picture, (right, down) on a canvas of (rows,
+    columns), None where the file names none. lossy: whether packing changed the pixels.
     """
 
     pixels: Pixels
@@ -120,26 +119,32 @@ class Photo:
 
     @property
     def primaries(self) -> Matrix:
-        """(3, 3): what red, green and blue stand for; those of sRGB where no profile says otherwise."""
+        """Return (3, 3), the primaries for red, green and blue; those of sRGB where no profile names
+        others.
+        """
         found = read_primaries(self.icc) if self.icc else None
         return srgb() if found is None else found
 
     @property
     def size(self) -> tuple[int, int]:
-        """(height, width) in pixels."""
+        """Return (height, width) in pixels."""
         return self.pixels.shape[0], self.pixels.shape[1]
 
     @property
     def bits(self) -> int:
-        """8, 16 or 32 a channel: the depth of the file, and of a file that keeps all of it."""
+        """Return the bits per channel, 8, 16 or 32: the depth of the file, and of a file that keeps all of
+        it.
+        """
         if self.pixels.dtype == np.float32:
             return 32
         codes = self.curves.srgb.shape[1] if self.curves else np.iinfo(self.pixels.dtype).max + 1
         return 8 if codes == 256 else 16
 
     def with_bits(self, bits: int | None) -> Photo:
-        """The same photo with 16 bits a channel where it has 8 and more are asked for, so that its light is
-        computed in them."""
+        """Return the photo with 16 bits per channel where it has 8 and more are requested.
+
+        Its light is then computed at that depth.
+        """
         if bits != 16 or self.bits != 8:
             return self
         wide = self.pixels if self.pixels.dtype == np.uint16 else self.pixels * np.uint16(257)
@@ -147,14 +152,14 @@ class Photo:
         return replace(self, pixels=wide, alpha=alpha, curves=self.curves and self.curves.with_codes(65536))
 
     def with_pixels(self, pixels: Pixels) -> Photo:
-        """The same photo with other pixels of the same shape and dtype."""
+        """Return the same photo with other pixels of the same shape and dtype."""
         return replace(self, pixels=pixels)
 
 
 def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
-    """Read a photo; what: how an error calls it; page: which one, where a file has several, 0 the first.
+    """Read a photo. what: its name in errors. page: the index of the page in a file with several, from 0.
 
-    Raises InputError for a file that is missing, damaged, cut short, of more than MOST_PIXELS, or of a kind
+    Raises InputError for a file that is missing, damaged, cut short, larger than MOST_PIXELS, or of a kind
     that cannot be kept whole (camera raw, HDR, floating point, 32-bit integers).
     """
     check_readable(path, what)
@@ -162,7 +167,7 @@ def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
     reader = None
     try:
         with path.open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's doubts about EXIF and size; both are dealt with here
+            warnings.simplefilter("ignore")  # Pillow warns about EXIF and size; this function handles both
             if what == "photo" and (reader := find_reader(file.read(64), path.suffix)):
                 return reader.load()(path)
             file.seek(0)
@@ -185,7 +190,7 @@ def read_photo(path: Path, what: str = "photo", page: int = 0) -> Photo:
 
 
 def check_output(path: Path, photo: Photo, encoding: Encoding = PLAIN) -> None:
-    """Raise InputError where `write_photo` would fail: to be known before the work is done."""
+    """Raise InputError where `write_photo` would fail, so that the error comes before the work is done."""
     form = _form(path)
     if problem := encoding.problem(form):
         raise InputError(f"Cannot write {path}: {problem}.")
@@ -214,9 +219,9 @@ def write_photo(
 ) -> tuple[str, ...]:
     """Write a photo whole or not at all, with the settings that made it as JSON in its metadata.
 
-    They stand in XMP, and in a PNG also in the iTXt chunk "Dior". generated: whether XMP says that a model
-    had a hand in the picture. Returns sentences about what the format cannot hold. Raises InputError where
-    the file cannot be written.
+    The settings are stored in XMP, and in a PNG also in the iTXt chunk "Dior". generated: whether XMP states
+    that a model contributed to the picture. Returns sentences about what the format cannot hold. Raises
+    InputError where the file cannot be written.
     """
     form = _form(path)
     if form == "EXR":
@@ -254,7 +259,7 @@ def _read(file: IO[bytes], page: int) -> Photo:
         opened = Image.open(file, formats=_READABLE)
         if page:
             opened.seek(page)
-        opened.info.pop("xmp", None)  # by which Pillow would turn a TIFF; only EXIF's orientation counts
+        opened.info.pop("xmp", None)  # Pillow would turn a TIFF by it; only EXIF's orientation counts
         return opened
 
     file.seek(0)
@@ -335,7 +340,7 @@ def _refuse_unknown_depth(image: Image.Image) -> None:
 
 
 def interpret_image(image: Image.Image, icc: bytes) -> tuple[Pixels | None, Coloured]:
-    """(alpha, colours) of a decoded 8-bit picture of any mode."""
+    """Return (alpha, colours) of a decoded 8-bit picture of any mode."""
     if image.mode == "CMYK":
         if icc[16:20] != b"CMYK":
             return None, Coloured(np.asarray(image.convert("RGB")))
@@ -353,17 +358,17 @@ def interpret_image(image: Image.Image, icc: bytes) -> tuple[Pixels | None, Colo
 def _interpret_deep(
     samples: np.ndarray, info: Mapping[Any, Any], icc: bytes
 ) -> tuple[Pixels | None, Coloured]:
-    """(alpha, colours) of (H, W, 1..4) 16-bit samples."""
+    """Return (alpha, colours) of (H, W, 1..4) 16-bit samples."""
     alpha = None
     if samples.shape[-1] in (2, 4):
         samples, alpha = samples[..., :-1], samples[..., -1]
-    elif (key := info.get("transparency")) is not None:  # one colour stands for "nothing here"
+    elif (key := info.get("transparency")) is not None:  # one colour stands for transparent pixels
         alpha = np.where((samples == np.asarray(key)).all(axis=-1), 0, 65535).astype(np.uint16)
     return alpha, interpret(samples, icc)
 
 
 def photo_of(image: Image.Image) -> Photo:
-    """A Pillow image of 8 bits as `read_photo` would read its file. Raises InputError."""
+    """Return the photo of an 8-bit Pillow image, as `read_photo` would read its file. Raises InputError."""
     try:
         image.load()
         facts = facts_of(image)
@@ -377,7 +382,7 @@ def photo_of(image: Image.Image) -> Photo:
 
 
 def image_of(photo: Photo, pixels: Pixels) -> Image.Image:
-    """A Pillow image of 8 bits: other pixels in the photo's own encoding, with its alpha and metadata."""
+    """Return an 8-bit Pillow image: other pixels in the photo's encoding, with its alpha and metadata."""
     image = Image.fromarray(_samples(photo.with_pixels(pixels), "WEBP"))
     image.info = {name: value for name, value in _info(photo).items() if value}
     return image
@@ -388,7 +393,7 @@ def _info(photo: Photo) -> dict[str, Any]:
 
 
 def upright(photo: Photo, orientation: int) -> Photo:
-    """The photo turned as EXIF's orientation asks."""
+    """Return the photo turned as EXIF's orientation requires."""
     turn = _UPRIGHT.get(orientation, lambda a: a)
     pixels = np.ascontiguousarray(turn(photo.pixels))
     alpha = None if photo.alpha is None else np.ascontiguousarray(turn(photo.alpha))
@@ -410,7 +415,7 @@ def _is_transparent(photo: Photo) -> bool:
 
 
 def _samples(photo: Photo, form: str, bits: int | None = None) -> Pixels:
-    """(H, W, 3 or 4) in the photo's own encoding, at the depth that the file will have."""
+    """Return (H, W, 3 or 4) samples in the photo's encoding, at the depth that the file will have."""
     bits = bits or (min(photo.bits, 16) if 16 in BITS[form] else 8)
     pixels = photo.curves.from_srgb(photo.pixels) if photo.curves else photo.pixels
     pixels = _to_depth(pixels, bits)
@@ -433,7 +438,7 @@ def _to_depth(samples: Pixels, bits: int) -> Pixels:
 def _metadata(
     photo: Photo, form: str, settings: Mapping[str, Any], generated: bool
 ) -> tuple[bytes, bytes, tuple[str, ...]]:
-    """XMP and IPTC as the format holds them, and sentences about what it does not hold."""
+    """Return XMP and IPTC as the format holds them, and sentences about what it does not hold."""
     text, iptc, notices = json.dumps(settings), photo.iptc, []
     packet = xmp.merge(photo.xmp, text, generated)
     if form == "JPEG" and len(packet) > _JPEG_SEGMENT - 29:
@@ -478,7 +483,7 @@ def _write_tiff(file: IO[bytes], samples: Pixels, photo: Photo, packet: bytes, i
         tags[34675] = entry(UNDEFINED, photo.icc)
     if photo.dpi:
         tags[282], tags[283] = (entry(RATIONAL, dots) for dots in photo.dpi)
-        tags[296] = entry(SHORT, 2)  # dots an inch
+        tags[296] = entry(SHORT, 2)  # dots per inch
     write_tiff(file, samples, tags, children)
 
 
@@ -506,7 +511,7 @@ def _write_jxl(path: Path, samples: Pixels, photo: Photo, encoding: Encoding) ->
     write = _jxl_writer(path)
     with replacing(path) as file:
         draft = Path(file.name)
-        named = draft.with_suffix(".jxl")  # the library goes by the name
+        named = draft.with_suffix(".jxl")  # the library chooses the format by the name
         try:
             write(named, samples, photo.icc, encoding.quality)
             with named.open("rb") as packed:
@@ -519,7 +524,7 @@ def _write_jxl(path: Path, samples: Pixels, photo: Photo, encoding: Encoding) ->
 
 
 def _has_gain_map(image: Image.Image) -> bool:
-    """Whether a JPEG says that it is Ultra HDR, by its XMP or by ISO 21496-1."""
+    """Return whether a JPEG is marked as Ultra HDR, by its XMP or by ISO 21496-1."""
     if image.format not in ("JPEG", "MPO"):
         return False
     segments = [data for _, data in getattr(image, "applist", [])]
@@ -527,7 +532,7 @@ def _has_gain_map(image: Image.Image) -> bool:
 
 
 def _kind_of(path: Path) -> str:
-    """Why Pillow does not know the file, as the end of a sentence."""
+    """Return why Pillow does not recognise the file, as the end of a sentence."""
     with path.open("rb") as file:
         head = file.read(16)
     if not head:

@@ -1,7 +1,7 @@
-"""The chunks of a PNG beside its pixels, by the file's own bytes: colour, place and metadata.
+"""Read the chunks of a PNG other than its pixels from the file's bytes: colour, place and metadata.
 
-Pillow drops some of them (cICP, oFFs, caNv) and finds others only after it has decoded the pixels.
-PNG, third edition: https://www.w3.org/TR/png-3/
+Pillow drops some of them (cICP, oFFs, caNv) and finds others only after it has decoded the pixels. PNG, third
+edition: https://www.w3.org/TR/png-3/
 """
 
 from __future__ import annotations
@@ -18,7 +18,9 @@ _RAW = b"Raw profile type "
 
 
 def read_chunks(file: IO[bytes]) -> dict[bytes, bytes]:
-    """The chunks that are wanted here, by name; texts that matter stand under b"xmp", b"exif" and b"iptc".
+    """Return the needed chunks by name.
+
+    Metadata from text chunks is stored under b"xmp", b"exif" and b"iptc".
 
     Damaged chunks are left out.
     """
@@ -47,7 +49,7 @@ def read_chunks(file: IO[bytes]) -> dict[bytes, bytes]:
 
 
 def raw_profile(name: str, data: bytes) -> bytes:
-    """The text of ImageMagick's "Raw profile type": the only place for IPTC in a PNG."""
+    """Return the text of ImageMagick's "Raw profile type", the only place for IPTC in a PNG."""
     digits = data.hex()
     lines = "\n".join(digits[i : i + 72] for i in range(0, len(digits), 72))
     return f"\n{name}\n{len(data):8d}\n{lines}\n".encode()

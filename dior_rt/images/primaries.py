@@ -1,4 +1,4 @@
-"""Primaries: which light red, green and blue stand for, and how light moves from one set to another.
+"""Primaries: the light that red, green and blue stand for, and the conversion of light between sets of them.
 
 Light has one meaning in the whole program: linear light in the photo's own primaries. Strokes and maps that
 come in other primaries are converted in linear light before anything is computed. A file that names no
@@ -43,7 +43,10 @@ _SAME = 2e-3  # of two matrices: what ICC's fixed-point numbers and other whites
 
 
 def to_xyz(xy: Chromaticities) -> Matrix:
-    """(3, 3): linear RGB -> XYZ under D50, by the Bradford transform. Raises ValueError for no real space."""
+    """Return (3, 3), linear RGB -> XYZ under D50, by the Bradford transform.
+
+    Raises ValueError for no real space.
+    """
     x, y = np.array(xy[::2], np.float64), np.array(xy[1::2], np.float64)
     if not (np.isfinite([x, y]).all() and (np.abs([x, y]) < 10).all() and (y[3] > 1e-3) and abs(y).min() > 0):
         raise ValueError("its primaries make no sense")
@@ -64,19 +67,24 @@ def _srgb() -> Matrix:
 
 
 def srgb() -> Matrix:
-    """The primaries of sRGB."""
+    """Return the primaries of sRGB."""
     return _srgb().copy()
 
 
 def conversion(source: Matrix, target: Matrix) -> Matrix | None:
-    """(3, 3): linear light in the source's primaries -> in the target's; None where they are the same."""
+    """Return (3, 3), linear light in source primaries -> target primaries, or None where they are the
+    same.
+    """
     if np.abs(source - target).max() <= _SAME:
         return None
     return np.linalg.solve(target, source).astype(np.float64)
 
 
 def convert(light: NDArray[Any], matrix: Matrix | None) -> NDArray[Any]:
-    """(..., 3) light by a `conversion`; colours outside the target's gamut are taken to its border, at 0."""
+    """Convert (..., 3) light by a `conversion`.
+
+    Colours outside the target's gamut are clipped to its border, at 0.
+    """
     if matrix is None:
         return light
     return np.maximum(light @ matrix.T.astype(light.dtype), light.dtype.type(0))
@@ -86,7 +94,7 @@ def convert(light: NDArray[Any], matrix: Matrix | None) -> NDArray[Any]:
 
 
 def make_profile(xy: Chromaticities, curve: bytes) -> bytes:
-    """A display profile (ICC version 2) of primaries and a curve tag, as `gamma_tag` and others make."""
+    """Return a display profile (ICC version 2) of primaries and a curve tag, such as `gamma_tag` makes."""
     columns = to_xyz(xy).T
     names = (b"rXYZ", b"gXYZ", b"bXYZ")
     tags = {name: _xyz_tag(column) for name, column in zip(names, columns, strict=True)}
@@ -110,18 +118,18 @@ def make_profile(xy: Chromaticities, curve: bytes) -> bytes:
 
 
 def gamma_tag(power: float) -> bytes:
-    """A curve tag of one power, encoded to linear."""
+    """Return a curve tag of one power, encoded to linear."""
     return struct.pack(">4sIIHxx", b"curv", 0, 1, max(1, min(65535, round(power * 256))))
 
 
 def parametric_tag(g: float, a: float, b: float, c: float, d: float) -> bytes:
-    """A curve tag: (a x + b)^g from x = d on, c x below."""
+    """Return a curve tag: (a x + b)^g from x = d on, c x below."""
     return struct.pack(">4sIHH5i", b"para", 0, 3, 0, *(round(v * 65536) for v in (g, a, b, c, d)))
 
 
 SRGB_TAG = parametric_tag(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
 REC_709_TAG = parametric_tag(1 / 0.45, 1 / 1.099, 0.099 / 1.099, 1 / 4.5, 0.081)
-#: ITU-T H.273, table 3: the curves that a display shows as they are.
+#: ITU-T H.273, table 3: the curves that a display shows unchanged.
 CURVES_BY_CODE: dict[int, bytes] = {
     1: REC_709_TAG,
     4: gamma_tag(2.2),
@@ -136,14 +144,15 @@ HDR_BY_CODE = {16: "PQ", 18: "HLG"}
 
 
 def adobe_rgb_profile() -> bytes:
-    """What a camera means by Adobe RGB."""
+    """Return the profile of Adobe RGB as cameras use it."""
     return make_profile(ADOBE_RGB, gamma_tag(563 / 256))
 
 
 def profile_of_codes(primaries: int, transfer: int) -> bytes:
-    """The profile that codes of ITU-T H.273 (PNG's cICP, AVIF's nclx) stand for; b"" for sRGB or unspecified.
+    """Return the profile that codes of ITU-T H.273 (PNG's cICP, AVIF's nclx) stand for; b"" for sRGB or
+    unspecified.
 
-    Raises ValueError for the curves of HDR, whose white no photo of this program can hold.
+    Raises ValueError for the curves of HDR, because no photo of this program can hold their white.
     """
     if transfer in HDR_BY_CODE:
         raise ValueError(
@@ -155,7 +164,7 @@ def profile_of_codes(primaries: int, transfer: int) -> bytes:
 
 
 def profile_of_png(gamma: bytes, chromaticities: bytes) -> bytes:
-    """The profile that the bytes of PNG's gAMA and cHRM (b"" for none) stand for; b"" for sRGB.
+    """Return the profile that the bytes of PNG's gAMA and cHRM (b"" for none) stand for; b"" for sRGB.
 
     Raises ValueError for values that make no sense.
     """
@@ -169,7 +178,7 @@ def profile_of_png(gamma: bytes, chromaticities: bytes) -> bytes:
         value = struct.unpack(">I", gamma)[0] / 100_000
         if not 0.05 <= value <= 20:
             raise ValueError("its gamma makes no sense")
-        if abs(value - 1 / 2.2) > 1e-3:  # 0.45455 is how a PNG says sRGB without saying it
+        if abs(value - 1 / 2.2) > 1e-3:  # many files use 0.45455 to mean sRGB without naming it
             curve = gamma_tag(1 / value)
     return b"" if xy is SRGB and curve is SRGB_TAG else make_profile(xy, curve)
 

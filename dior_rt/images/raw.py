@@ -1,7 +1,8 @@
-"""Camera raw by LibRaw (extra [raw]): developed to 16 bits in linear light and the camera's white balance.
+"""Read camera raw by LibRaw (extra [raw]), developed to 16 bits in linear light at the camera's white
+balance.
 
-The photo has the primaries of ProPhoto RGB, wide enough for what sensors see, and its profile. Nothing is
-brightened or sharpened, so that the light that is drawn adds to the light that the sensor counted.
+The photo has the primaries of ProPhoto RGB, which cover the gamut of sensors, and its profile. Nothing is
+brightened or sharpened, so that drawn light adds to the light that the sensor counted.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ DEVELOPED: Final = "It is a camera raw file, developed without a tone curve in t
 
 
 def read(path: Path) -> Photo:
-    """Develop a file. Raises ValueError for one that is damaged, or of a camera that LibRaw does not know."""
+    """Develop a file. Raises ValueError for a damaged file, or for a camera that LibRaw does not support."""
     try:
         with rawpy.imread(str(path)) as raw:
             if not 0 < raw.sizes.width * raw.sizes.height <= MOST_PIXELS:
@@ -38,7 +39,7 @@ def read(path: Path) -> Photo:
     except rawpy.LibRawError as error:
         text = error.args[0] if error.args else error
         raise ValueError(text.decode() if isinstance(text, bytes) else str(text)) from error
-    # From linear light to a curve whose 16 bits are spent as the eye sees them.
+    # Encode linear light by a curve that distributes the 16 bits as the eye perceives them.
     curved = np.round((np.arange(65536) / 65535) ** (1 / GAMMA) * 65535).astype(np.uint16)[linear]
     coloured = interpret(curved, make_profile(PROPHOTO, gamma_tag(GAMMA)))
     return Photo(coloured.pixels, None, coloured.curves, coloured.icc, notices=(DEVELOPED, *coloured.notices))

@@ -1,6 +1,7 @@
-"""Photos that Pillow does not read: which module reads them, and which extra it needs.
+"""The photos that Pillow does not read: the module that reads each kind, and the extra that it needs.
 
-A reader is a module of this package with `read(path) -> Photo`. It is imported when a file of its kind comes.
+A reader is a module of this package with `read(path) -> Photo`. It is imported when a file of its kind is
+read.
 """
 
 from __future__ import annotations
@@ -22,13 +23,16 @@ RAW_SUFFIXES: Final = (
 
 
 class MissingReader(Exception):  # noqa: N818 - it ends as part of an InputError
-    """A reader's extra is not installed; its text names it, as the end of a sentence."""
+    """A reader's extra is not installed. The error's text names it, as the end of a sentence."""
 
 
 @dataclass(frozen=True)
 class Reader:
-    """module: of dior_rt.images. kind: for people. extra: what brings its library, or None for none.
-    fits: whether a file with these first bytes and this suffix is of the kind."""
+    """A reader of one kind of file.
+
+    module: its name in dior_rt.images. kind: the kind's name for users. extra: the extra that installs its
+    library, or None for none. fits: whether a file with these first bytes and this suffix is of the kind.
+    """
 
     module: str
     kind: str
@@ -36,7 +40,7 @@ class Reader:
     fits: Callable[[bytes, str], bool]
 
     def load(self) -> Callable[[Path], Photo]:
-        """The module's `read`. Raises MissingReader where its extra is not installed."""
+        """Return the module's `read`. Raises MissingReader where its extra is not installed."""
         try:
             return import_module(f"dior_rt.images.{self.module}").read
         except ModuleNotFoundError as error:
@@ -74,11 +78,11 @@ READERS: Final = (
 
 
 def default_form(photo: Path) -> str:
-    """The suffix of a result that keeps what the photo has: "tif" for raw, "exr" for EXR, else "png"."""
+    """Return the suffix of a result that keeps the photo's data: "tif" for raw, "exr" for EXR, else "png"."""
     suffix = photo.suffix.lower()
     return "exr" if suffix == ".exr" else "tif" if suffix in RAW_SUFFIXES else "png"
 
 
 def find_reader(head: bytes, suffix: str) -> Reader | None:
-    """The reader of a file with these first bytes, or None where Pillow reads it or nobody does."""
+    """Return the reader of a file with these first bytes, or None where Pillow reads it or no reader fits."""
     return next((reader for reader in READERS if reader.fits(head, suffix.lower())), None)

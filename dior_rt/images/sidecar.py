@@ -1,4 +1,4 @@
-"""XMP beside a picture, for programs that read such sidecars, and formats that hold no metadata."""
+"""Write XMP beside a picture, for programs that read sidecars and for formats that hold no metadata."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from dior_rt.images.photo import Photo
 
 
 def sidecar_path(picture: Path) -> Path:
-    """Where a picture's sidecar is: a.xmp of a.png."""
+    """Return the path of a picture's sidecar: a.xmp for a.png."""
     return picture.with_suffix(".xmp")
 
 
 def write_sidecar(picture: Path, photo: Photo, settings: Mapping[str, Any]) -> None:
-    """Write the sidecar of a result: the photo's own XMP, and the settings. Raises InputError."""
+    """Write the sidecar of a result: the photo's XMP, and the settings. Raises InputError."""
     with replacing(sidecar_path(picture)) as file:
         file.write(xmp.merge(photo.xmp, json.dumps(settings), True))

@@ -1,4 +1,4 @@
-"""Strokes and Lumi maps in and out of files. docs and README call these the ways to draw light.
+"""Read and write strokes and Lumi maps. The documentation calls these formats the ways to draw light.
 
     strokes.png    RGBA: where alpha > 0 light is specified, and the colour is that light, sRGB-encoded
     map.png        RGB (any picture): light is specified everywhere, or with key "black" wherever it is not
@@ -49,13 +49,16 @@ from dior_rt.records import read_json
 
 Key = Literal["black"]
 
-SAME_SHAPE = 0.1  # of two shapes: the largest logarithm of the ratio of their aspect ratios
+SAME_SHAPE = 0.1  # the largest difference between the logarithms of two shapes' aspect ratios
 _MOST_JSON_BYTES = 16 << 20
 
 
 @dataclass(frozen=True)
 class DrawingFile:
-    """strokes: as `Relighter.relight` takes them. notices: sentences about what their file could not say."""
+    """The content of a drawing.
+
+    strokes: as `Relighter.relight` takes them. notices: sentences about missing data.
+    """
 
     strokes: NDArray | list[Stroke] | list[Light]
     notices: tuple[str, ...] = ()
@@ -64,7 +67,7 @@ class DrawingFile:
 def read_strokes(
     path: Path, photo_size: tuple[int, int], key: Key | None = None
 ) -> NDArray | list[Stroke] | list[Light]:
-    """The strokes of `read_drawing`, over a photo with sRGB's primaries."""
+    """Return the strokes of `read_drawing`, over a photo with sRGB's primaries."""
     return read_drawing(path, photo_size, key).strokes
 
 
@@ -75,13 +78,14 @@ def read_drawing(
     page: int = 0,
     primaries: Matrix | None = None,
 ) -> DrawingFile:
-    """Strokes from a file of any kind above, ready for `Relighter.relight`.
+    """Read strokes from a file of any kind above, ready for `Relighter.relight`.
 
     photo_size: (height, width) of the photo. key: "black" reads pixels that are exactly black as unspecified.
-    page: which one is read of a file with several. primaries: the photo's own, None for sRGB's; light in
-    others is converted. A raster comes as (H, W, 4): uint8 or uint16, sRGB-encoded, or float32, linear;
-    the last channel is the mask. JSON comes as strokes in the photo's pixels, or as lights where any of
-    them blends; a project as its lights. Raises InputError for what cannot be read or makes no sense.
+    page: the index of the page in a file with several. primaries: the photo's primaries, None for sRGB's;
+    light in other primaries is converted. A raster is returned as (H, W, 4): uint8 or uint16, sRGB-encoded,
+    or float32, linear; the last channel is the mask. JSON is returned as strokes in the photo's pixels, or as
+    lights where any of them blends; a project is returned as its lights. Raises InputError for a file that
+    cannot be read or makes no sense.
     """
     target = srgb() if primaries is None else primaries
     if path.suffix.lower() == project.SUFFIX:
@@ -102,7 +106,7 @@ def read_drawing(
 
 
 def read_lumi(path: Path) -> NDArray[np.float32]:
-    """A dense Lumi map (H, W, 3), linear float32 >= 0 in sRGB's primaries, from any raster above.
+    """Return a dense Lumi map (H, W, 3), linear float32 >= 0 in sRGB's primaries, from any raster above.
 
     Pictures are decoded from sRGB. Raises InputError, also for a map that leaves pixels unspecified.
     """
@@ -116,7 +120,7 @@ def read_lumi(path: Path) -> NDArray[np.float32]:
 
 
 def check_lumi_output(path: Path) -> None:
-    """Raise InputError where `write_lumi` would fail, as far as can be known."""
+    """Raise InputError where `write_lumi` would fail, as far as that can be checked."""
     if path.suffix.lower() in (".npy", ".exr"):
         check_writable(path)
     else:
@@ -126,9 +130,9 @@ def check_lumi_output(path: Path) -> None:
 def write_lumi(
     path: Path, lumi: NDArray[np.float32], settings: Mapping[str, Any], primaries: Matrix | None = None
 ) -> None:
-    """Write a Lumi map (H, W, 3): .npy and .exr keep it, a picture shows it, clipped to display white.
+    """Write a Lumi map (H, W, 3). A .npy or .exr keeps all of it; a picture is clipped to display white.
 
-    primaries: of the map, None for sRGB's, which all files get.
+    primaries: those of the map, None for sRGB's. Every file is written with sRGB's.
     """
     lumi = lumi if primaries is None else convert(lumi, conversion(primaries, srgb()))
     if path.suffix.lower() == ".npy":
@@ -140,14 +144,14 @@ def write_lumi(
 
 
 def check_strokes_output(path: Path) -> None:
-    """Raise InputError where `write_strokes` would fail, as far as can be known."""
+    """Raise InputError where `write_strokes` would fail, as far as that can be checked."""
     if path.suffix.lower() not in (".png", ".npy", ".exr"):
         raise InputError(f"Cannot write {path}: the name of strokes must end in .png, .npy or .exr.")
     check_writable(path)
 
 
 def write_strokes(path: Path, strokes: Strokes, settings: Mapping[str, Any]) -> None:
-    """Write strokes: .npy (H, W, 4) and .exr keep them, an RGBA .png holds 8 bits, up to display white."""
+    """Write strokes. A .npy (H, W, 4) or .exr keeps all; an RGBA .png holds 8 bits, up to display white."""
     check_strokes_output(path)
     if path.suffix.lower() == ".npy":
         return _write_npy(path, np.dstack([strokes.light, strokes.mask]))
@@ -162,7 +166,10 @@ def write_strokes(path: Path, strokes: Strokes, settings: Mapping[str, Any]) -> 
 
 @dataclass(frozen=True)
 class Raster:
-    """pixels: (H, W, 4) light and mask; see `read_drawing`. primaries: of the light."""
+    """A raster of light.
+
+    pixels: (H, W, 4) light and mask, see `read_drawing`. primaries: those of the light.
+    """
 
     pixels: NDArray
     primaries: Matrix = field(default_factory=srgb)
@@ -194,10 +201,9 @@ def _read_raster(path: Path, what: str, photo_size: tuple[int, int] | None, page
 
 
 def _clean_exr(pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """A picture as filters and renderers leave it: alpha brought into 0..1, negative light to 0, both
-    counted.
+    """Clean a picture of filters and renderers: clip alpha to 0..1 and negative light to 0, and count both.
 
-    Light comes out divided by its alpha.
+    The light is returned divided by its alpha.
     """
     notices = []
     if pixels.shape[2] == 4:
@@ -206,7 +212,7 @@ def _clean_exr(pixels: NDArray[np.float32]) -> tuple[NDArray[np.float32], tuple[
         if outside:
             notices.append(f"Alpha outside 0..1 in {outside} pixels is brought to the nearer end.")
             np.clip(alpha, 0, 1, out=alpha)
-        with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is refused
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite results are refused
             np.divide(pixels[..., :3], pixels[..., 3:], out=pixels[..., :3], where=pixels[..., 3:] > 0)
     light = pixels[..., :3]
     negative = (light < 0).any(axis=-1)
@@ -247,7 +253,7 @@ def check_canvas(path: Path, what: str, canvas: tuple[int, int]) -> None:
 
 
 def _place(pixels: NDArray, offset: tuple[int, int], canvas: tuple[int, int]) -> NDArray:
-    """A cut-out picture where it lies on its canvas of (rows, columns); around it nothing is specified."""
+    """Place a cut-out picture on its canvas of (rows, columns). The pixels around it are unspecified."""
     placed = np.zeros((*canvas, pixels.shape[2]), pixels.dtype)
     (x, y), (height, width) = offset, pixels.shape[:2]
     top, left = max(y, 0), max(x, 0)
@@ -260,7 +266,8 @@ def _place(pixels: NDArray, offset: tuple[int, int], canvas: tuple[int, int]) ->
 def _read_npy(path: Path, what: str) -> NDArray[np.float32]:
     check_readable(path, what)
     try:
-        # Mapped, so that a header which promises more than the file holds takes no memory.
+        # The file is memory-mapped, so that a header which promises more than the file holds takes no
+        # memory.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if not isinstance(array, np.ndarray):
             array.close()
@@ -271,7 +278,7 @@ def _read_npy(path: Path, what: str) -> NDArray[np.float32]:
             raise ValueError(f"its light must be floating-point and linear, not {array.dtype}")
         if array.shape[0] * array.shape[1] > MOST_PIXELS:
             raise ValueError(f"it has more than {MOST_PIXELS // 10**6} megapixels")
-        with np.errstate(over="ignore"):  # too large for float32 becomes infinite, and that is refused
+        with np.errstate(over="ignore"):  # too large values become infinite and are refused
             return np.array(array, np.float32)
     except (*DAMAGE, MemoryError, TokenError, RecursionError) as error:
         raise InputError(f"Cannot read the {what} {path}: {reason(error)}.") from error
@@ -315,18 +322,18 @@ def _blend(item: dict[str, Any]) -> Blend:
 
 
 def _layers(strokes: list[Stroke], blends: list[Blend]) -> list[Light]:
-    """Strokes that follow one another with the same blend are one layer."""
+    """Return layers: consecutive strokes with the same blend form one layer."""
     runs = groupby(zip(blends, strokes, strict=True), key=itemgetter(0))
     return [Light(tuple(stroke for _, stroke in run), blend) for blend, run in runs]
 
 
 def _scale(size: Any, photo_size: tuple[int, int]) -> tuple[float, float]:
-    """Pixels of the photo in one of the drawing's, across and down."""
+    """Return the photo's pixels per pixel of the drawing, across and down."""
     (columns, rows), (height, width) = _numbers(size, 2, "size"), photo_size
     if not (min(columns, rows) > 0 and max(columns, rows) <= FARTHEST):
         raise ValueError("size must be [width, height] in pixels")
     off = abs(math.log(columns / rows * height / width))
-    # One pixel of a very small drawing is so large a share that any shape would pass.
+    # One pixel of a very small drawing is such a large share that any shape would pass.
     if off > SAME_SHAPE or not math.isfinite(off):
         raise ValueError(
             f"size is {columns:g} x {rows:g} and the photo is {width} x {height}: the shapes differ"
@@ -351,14 +358,14 @@ def _parse_stroke(item: Any, scale: tuple[float, float]) -> Stroke:
 
 def _points(values: list[Any]) -> list[tuple[float, float]]:
     flat = list(chain.from_iterable(values)) if set(map(type, values)) <= {list} else []
-    if flat and set(map(len, values)) == {2} and set(map(type, flat)) <= {int, float}:  # of many, fast
+    if flat and set(map(len, values)) == {2} and set(map(type, flat)) <= {int, float}:  # fast for many points
         numbers = list(map(float, flat))
         return list(zip(numbers[::2], numbers[1::2], strict=True))
     return [(x, y) for x, y in (_numbers(point, 2, "each point") for point in values)]
 
 
 def _color(value: Any, what: str) -> tuple[float, ...]:
-    """Linear RGB of "#rrggbb", which is sRGB, or of [r, g, b], which is linear already."""
+    """Return the linear RGB of "#rrggbb", which is sRGB, or of [r, g, b], which is already linear."""
     if not isinstance(value, str):
         return tuple(_numbers(value, 3, what))
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", value):

@@ -1,4 +1,6 @@
-"""What the pages of a TIFF are, by its tags: kinds and depths that Pillow misreads, and where a page lies."""
+"""Read the facts of a TIFF's pages from its tags: kinds and depths that Pillow misreads, and a page's
+place.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,11 @@ _MAKERS = ("nikon", "canon", "sony", "pentax", "samsung", "hasselblad", "phase o
 
 @dataclass(frozen=True)
 class TiffFacts:
-    """pages: how many. size: (rows, columns) of the first page. offset: of the page in pixels, right and
-    down. exif, iptc: of the page. is_raw: a camera's raw file. depth: its samples in words, where they
-    cannot be read. lossy: whether its compression changes pixels.
+    """The facts of a TIFF and one of its pages.
+
+    pages: the number of pages. size: (rows, columns) of the first page. offset: the page's place in pixels,
+    right and down. exif, iptc: those of the page. is_raw: whether it is a camera's raw file. depth: a
+    description of its samples, where they cannot be read. lossy: whether its compression changes pixels.
     """
 
     pages: int
@@ -36,9 +40,9 @@ class TiffFacts:
 
 
 def read_facts(file: IO[bytes], page: int = 0) -> TiffFacts:
-    """The facts of a page (0 is the first; one beyond the last says as much as an empty one).
+    """Return the facts of a page (0 is the first). A page beyond the last has the facts of an empty one.
 
-    Raises ValueError for a file without a TIFF's header.
+    Raises ValueError for a file without a TIFF header.
     """
     reader = Reader(file)
     pages: list[tuple[int, Directory]] = []
@@ -81,14 +85,14 @@ def _is_raw(reader: Reader, first: Directory) -> bool:
 
 
 def _place(tags: Directory) -> tuple[int, int]:
-    """A page's offset in pixels: its position stands in the resolution's unit."""
+    """Return a page's offset in pixels. Its position is stored in the unit of the resolution."""
     across = number(tags, _X) * number(tags, _X_DPI, 1)
     down = number(tags, _Y) * number(tags, _Y_DPI, 1)
     return round(across), round(down)
 
 
 def _unreadable_depth(tags: Directory) -> str:
-    """The samples in words, where neither Pillow nor `sixteen_bit` reads them right; else ""."""
+    """Describe the samples where neither Pillow nor `sixteen_bit` reads them correctly, else return ""."""
     bits = int(max(tags[_BITS].numbers(), default=1)) if _BITS in tags else 1
     kind = int(max(tags[_FORMAT].numbers(), default=1)) if _FORMAT in tags else 1
     photometric = int(number(tags, _PHOTOMETRIC, 1))

@@ -1,6 +1,7 @@
-"""XMP: the photo's own packet, with the settings and the origin of the result written into it.
+"""Write the settings and the origin of the result into the photo's XMP packet.
 
-ISO 16684-1. The origin is IPTC's DigitalSourceType, by which a viewer can say that a model had a hand in it.
+ISO 16684-1. The origin is IPTC's DigitalSourceType. From it, a viewer can state that a model contributed to
+the picture.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _IPTC = "http://iptc.org/std/Iptc4xmpExt/2008-02-29/"
 _DIOR = "urn:dior-rt:1.0:"
 SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
 
-#: No longer true of the result, or written anew.
+#: Properties that are no longer true of the result, or that are written anew.
 _STALE = {
     (_TIFF, "Orientation"),
     (_TIFF, "ImageWidth"),
@@ -39,7 +40,7 @@ _TAIL = '<?xpacket end="w"?>'
 
 
 def is_sound(packet: bytes) -> bool:
-    """Whether a packet can be carried over."""
+    """Return whether a packet can be carried over."""
     try:
         _parse(packet)
     except ValueError:
@@ -48,7 +49,7 @@ def is_sound(packet: bytes) -> bool:
 
 
 def merge(packet: bytes, settings: str, generated: bool) -> bytes:
-    """A packet (b"" for none) with the settings as text in it, and with the origin where it was generated.
+    """Return a packet (b"" for none) with the settings as text, and with the origin where it was generated.
 
     Raises ValueError for a damaged packet.
     """
@@ -64,12 +65,12 @@ def merge(packet: bytes, settings: str, generated: bool) -> bytes:
         description.setAttribute("xmlns:Iptc4xmpExt", _IPTC)
         description.setAttributeNS(_IPTC, "Iptc4xmpExt:DigitalSourceType", SOURCE_TYPE)
     rdf.appendChild(description)
-    assert document.documentElement is not None  # it holds rdf:RDF
+    assert document.documentElement is not None  # the packet holds rdf:RDF
     return f"{_HEAD}{document.documentElement.toxml()}{_TAIL}".encode()
 
 
 def read_settings(packet: bytes) -> str:
-    """The settings that `merge` wrote. Raises ValueError where there are none."""
+    """Return the settings that `merge` wrote. Raises ValueError where there are none."""
     _, rdf = _parse(packet)
     for element in rdf.getElementsByTagName("*"):
         if element.hasAttributeNS(_DIOR, "settings"):
@@ -78,11 +79,11 @@ def read_settings(packet: bytes) -> str:
 
 
 def _parse(packet: bytes) -> tuple[minidom.Document, minidom.Element]:
-    """The document and its rdf:RDF. Raises ValueError."""
+    """Return the document and its rdf:RDF. Raises ValueError."""
     if len(packet) > MOST_BYTES:
         raise ValueError("the XMP is too long")
     text = packet.strip(b"\0 \t\r\n")
-    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:  # nothing sound declares entities here
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:  # a sound packet declares no entities here
         raise ValueError("the XMP is damaged")
     try:
         document = minidom.parseString(text)

@@ -1,4 +1,4 @@
-"""The data renderer: photo-like scenes in Blender's Cycles, every light on its own.
+"""The data renderer: photo-like scenes in Blender's Cycles, with every light on its own.
 
 `assets` makes the folder of models, surfaces, panoramas and people. `scene` and the modules of the scene
 kinds (`rooms`, `tables`, `outdoors`, `portraits`) describe scenes as functions of a seed and that folder;

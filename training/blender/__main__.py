@@ -1,4 +1,4 @@
-"""`python -m dior_rt.training.blender`: make the asset folder, render views."""
+"""`python -m dior_rt.training.blender`: make the asset folder and render views."""
 
 from __future__ import annotations
 

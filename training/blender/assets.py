@@ -1,4 +1,4 @@
-"""The asset folder: models, surfaces, panoramas and people that scenes are made of.
+"""The asset folder: the models, surfaces, panoramas and people that scenes are made of.
 
     models/<catalogue>-<n>.npz   furniture, animals, plants, vehicles, as `save_model` writes them
     people/<n>.npz               dressed people, of the same format
@@ -35,7 +35,9 @@ BENCH_PANORAMAS: Final = ("night", "lobby", "park", "studio")
 
 
 def split_of(kind: str, name: str) -> Split:
-    """Say whether an asset is held out for the benchmark, by its name alone."""
+    """Return the split of an asset, by its name alone: "train", or "bench" for assets held out for the
+    benchmark.
+    """
     if kind == "panorama":
         return "bench" if name in BENCH_PANORAMAS else "train"
     share = int.from_bytes(hashlib.sha256(f"{kind}:{name}".encode()).digest()[:4], "big") / 2**32
@@ -46,8 +48,9 @@ def split_of(kind: str, name: str) -> Split:
 class Entry:
     """One model as the catalogue describes it.
 
-    size: width, depth, height in metres. elevation: of its foot above the floor. top: height at which things
-    can stand on it, or 0. place: "floor", "small", "wall", "outdoor", "vehicle", "animal" or "person".
+    size: width, depth, height in metres. elevation: the height of its foot above the floor. top: the height
+    at which objects can stand on it, or 0. place: "floor", "small", "wall", "outdoor", "vehicle", "animal" or
+    "person".
     """
 
     file: str
@@ -62,7 +65,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Assets:
-    """The asset folder, opened; meshes and tiles are read when a scene first asks for them."""
+    """The opened asset folder. Meshes and tiles are read when a scene first asks for them."""
 
     folder: Path
     entries: tuple[Entry, ...]
@@ -70,7 +73,7 @@ class Assets:
 
     @staticmethod
     def open(folder: Path) -> Assets:
-        """Raises InputError where the folder is none that `make_assets` wrote."""
+        """Open the folder. Raises InputError for a folder that `make_assets` did not write."""
         try:
             entries = json.loads((folder / "models.json").read_text())
             kinds = json.loads((folder / "surfaces" / "kinds.json").read_text())
@@ -92,11 +95,11 @@ class Assets:
         return np.concatenate(cells)[: len(self.kinds)]
 
     def tile(self, index: int) -> NDArray[np.uint8]:
-        """A surface's colours: (128, 128, 3), sRGB."""
+        """Return a surface's colours: (128, 128, 3), sRGB."""
         return self._tiles[index]
 
     def surfaces(self, split: Split, *kinds: str) -> list[int]:
-        """Indices of the split's surfaces, of the named kinds or of all."""
+        """Return the indices of the split's surfaces, of the named kinds or of all."""
         return [
             k
             for k, kind in enumerate(self.kinds)
@@ -104,7 +107,7 @@ class Assets:
         ]
 
     def models(self, split: Split, *places: str) -> list[Entry]:
-        """The split's models that belong in one of the places."""
+        """Return the split's models that belong in one of the places."""
         return [
             entry
             for entry in self.entries
@@ -113,7 +116,7 @@ class Assets:
         ]
 
     def panoramas(self, split: Split) -> list[str]:
-        """Names of the split's panoramas."""
+        """Return the names of the split's panoramas."""
         found = sorted(path.stem for path in self.folder.glob("panoramas/*.exr"))
         return [name for name in found if split_of("panorama", name) == split]
 
@@ -121,7 +124,7 @@ class Assets:
         return self.folder / "panoramas" / f"{name}.exr"
 
     def mesh(self, file: str) -> Mesh:
-        """A model's mesh; the last ones are kept."""
+        """Return a model's mesh. The last ones are cached."""
         return load_model(self.folder / file)
 
 

@@ -1,4 +1,4 @@
-"""Candidate cameras, as people hold them: the subject fills a good part of the frame."""
+"""Candidate cameras, placed as people hold them: the subject fills a large part of the frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.random import Generator
 from dior_rt.training.blender.meshes import triple
 from dior_rt.training.blender.scene import Camera, Vector
 
-CANDIDATES = 10  # for every view that is wanted
+CANDIDATES = 10  # per requested view
 
 
 def around(
@@ -25,11 +25,11 @@ def around(
     lift: tuple[float, float] = (0.0, 0.6),
     wide: tuple[float, float] = (28, 62),
 ) -> tuple[Camera, ...]:
-    """Cameras about a box from `low` to `high`.
+    """Return cameras about a box from `low` to `high`.
 
     facing, spread: mean and deviation of the direction from the subject to the camera, an angle about z.
-    room: corners that the cameras stay within. fill: range of the frame's share that the subject takes.
-    lift: range of the elevation, radians. wide: range of the field of view, degrees.
+    room: corners that the cameras stay within. fill: range of the frame's share that the subject fills. lift:
+    range of the elevation, radians. wide: range of the field of view, degrees.
     """
     middle, size = (low + high) / 2, high - low
     extent = max(float(np.hypot(size[0], size[1])) * 0.8, float(size[2]), 0.15)
@@ -66,7 +66,7 @@ def _one(
     if room:
         at = at.clip(room[0] + 0.25, room[1] - 0.25)
     frame = 2 * float(np.linalg.norm(at - middle)) * math.tan(math.radians(fov / 2))
-    slack = max(frame - extent, 0.2 * frame) / 2  # how far the subject may move in the frame
+    slack = max(frame - extent, 0.2 * frame) / 2  # the largest shift of the subject in the frame
     target = middle + rng.normal(0, 0.4, 3) * slack * [1, 1, 0.7]
     if np.linalg.norm(at[:2] - target[:2]) < 1e-3:
         target[0] += 0.01

@@ -1,4 +1,4 @@
-"""Making the asset folder from furniture archives and a folder of surfaces and panoramas."""
+"""Make the asset folder from furniture archives and a folder of surfaces and panoramas."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def make_assets(
 
 
 def add_people(out: Path, count: int, progress: Callable[[str], None] = lambda name: None) -> list[Entry]:
-    """Bring the people in an asset folder to `count`; those that are there stay. Raises InputError."""
+    """Bring the number of people in an asset folder to `count`. Existing ones stay. Raises InputError."""
     assets = Assets.open(out)
     make_folder(out / "people")
     entries = {entry.file: entry for entry in assets.entries}
@@ -75,7 +75,7 @@ def write_entries(out: Path, entries: list[Entry]) -> None:
 
 
 def attribution(entries: list[Entry]) -> str:
-    """Name every model with its author and licence, as CC BY asks."""
+    """Return a text that names every model with its author and licence, as CC BY requires."""
     lines = [
         "# Attribution",
         "",

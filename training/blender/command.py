@@ -1,4 +1,4 @@
-"""The data renderer's commands."""
+"""The commands of the data renderer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ app = typer.Typer(no_args_is_help=True, help="Render training views with Blender
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Read "i/n". Raises typer.BadParameter."""
+    """Return the numbers of "i/n". Raises typer.BadParameter."""
     index, _, count = text.partition("/")
     if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
         raise typer.BadParameter("write it as i/n with 0 <= i < n, for example 0/2")

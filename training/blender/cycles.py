@@ -1,9 +1,9 @@
-"""Building scenes in Blender and shooting them with Cycles; the only module that imports bpy.
+"""Build scenes in Blender and render them with Cycles. This is the only module that imports bpy.
 
-Every light is in a light group of its own, so one pass renders the pictures of all lights. Materials carry a
-second, white matte surface that one shared value switches on: with it and without bounces, a second pass
-renders all Lumi maps. The white surface keeps cut-outs and relief; white glass lets the same share of light
-pass as glass does, but shows as white.
+Every light is in a separate light group, so one pass renders the pictures of all lights. Materials carry a
+second, white matte surface, which one shared value switches on. With it and without bounces, a second pass
+renders all Lumi maps. The white surface keeps cut-outs and relief. White glass transmits the same share of
+light as glass does, but shows as white.
 """
 
 from __future__ import annotations
@@ -39,8 +39,11 @@ BOX_BLEND: Final = 0.2  # how far box projections fade into each other
 
 @dataclass(frozen=True)
 class ShootOptions:
-    """resolution: side in pixels. samples, lumi_samples: a pixel, shared by all lights. bounces: of light
-    after the first surface. threads: of Cycles. seed: of its noise."""
+    """The options of a shot.
+
+    resolution: side in pixels. samples, lumi_samples: per pixel, shared by all lights. bounces: those of
+    light after the first surface. threads: the threads of Cycles. seed: the seed of its noise.
+    """
 
     resolution: int = 128
     samples: int = 40
@@ -52,10 +55,10 @@ class ShootOptions:
 
 @dataclass(frozen=True)
 class Shot:
-    """One view's rasters, with noise, in any strength of the lights; names as in `store`.
+    """One view's rasters, with noise and at arbitrary strengths of the lights; names as in `store`.
 
-    images, lumi: (K, H, W, 3), the world last. guide_albedo, guide_normals: for the denoiser. normals: (H,
-    W, 3) in the scene's space.
+    images, lumi: (K, H, W, 3), the world last. guide_albedo, guide_normals: for the denoiser. normals: (H, W,
+    3) in the scene's space.
     """
 
     images: Raster
@@ -70,7 +73,7 @@ class Shot:
 
 
 class Studio:
-    """A scene built in Blender. There is one Blender a process, so one studio at a time."""
+    """A scene built in Blender. A process has one Blender, so one studio at a time."""
 
     def __init__(self, scene: BlenderScene, panorama_file: Path | None, options: ShootOptions) -> None:
         self.options = options
@@ -100,7 +103,7 @@ class Studio:
         self._files.cleanup()
 
     def cast(self, origin: NDArray[np.float64], directions: NDArray[np.float64], reach: float = 1e6) -> Hits:
-        """What rays from a point hit within `reach`."""
+        """Return what rays from a point hit within `reach`."""
         start = Vector(origin)
         found = [self._scene.ray_cast(self._graph, start, Vector(way), distance=reach) for way in directions]
         return Hits(
@@ -134,8 +137,11 @@ class Studio:
         )
 
     def _light(self, lamps: Sequence[Lamp]) -> None:
-        """Set the lamps. The objects stay from view to view: Cycles orders lights by when it first saw them,
-        and their order decides which light a random number picks."""
+        """Set the lamps. The objects stay from view to view.
+
+        Cycles orders lights by when it first saw them, and their order decides which light a random number
+        picks.
+        """
         while len(self._lamps) < len(lamps):
             placed = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "POINT"))
             placed.visible_camera = False
@@ -159,7 +165,7 @@ class Studio:
         self._scene.camera.matrix_world = Matrix(pose.tolist())
 
     def _render(self, name: str, paper: bool) -> dict[str, Any]:
-        """Render to a file of many channels and read it: the white surfaces with no bounces, or the scene."""
+        """Render to a file of many channels and read it: the white surfaces without bounces, or the scene."""
         options, cycles = self.options, self._scene.cycles
         bounces = 0 if paper else options.bounces
         cycles.max_bounces = cycles.diffuse_bounces = cycles.glossy_bounces = bounces
@@ -176,7 +182,9 @@ class Studio:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Blender's line a sample off the terminal; it writes past Python, to the process's own output."""
+    """Suppress Blender's line per sample on the terminal. It bypasses Python and goes to the process's
+    output.
+    """
     sys.stdout.flush()
     shown, hidden = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
@@ -215,7 +223,7 @@ def _configure(scene: Any, layer: Any, options: ShootOptions) -> None:
 
 
 def _paper_switch() -> Any:
-    """A node group with one value: 1 makes every surface white and matte."""
+    """Return a node group with one value: 1 makes every surface white and matte."""
     group = bpy.data.node_groups.new("paper", "ShaderNodeTree")
     group.interface.new_socket("paper", in_out="OUTPUT", socket_type="NodeSocketFloat")
     value, out = group.nodes.new("ShaderNodeValue"), group.nodes.new("NodeGroupOutput")
@@ -247,13 +255,13 @@ def _mesh(mesh: Mesh, paper: Any) -> Any:
 
 
 class _Nodes:
-    """A node tree with one-line ways to add to it."""
+    """A node tree with short methods to add nodes to it."""
 
     def __init__(self, tree: Any) -> None:
         self.tree = tree
 
     def add(self, kind: str, *inputs: Any, **properties: Any) -> Any:
-        """A node with its inputs set in order (None leaves one as it is); returns the node."""
+        """Add a node with its inputs set in order (None leaves one unchanged), and return it."""
         node = self.tree.nodes.new(kind)
         for name, value in properties.items():
             setattr(node, name, value)
@@ -365,7 +373,7 @@ def _world(scene: Any, panorama: Panorama, file: Path) -> Any:
 
 
 def _set_lamp(placed: Any, lamp: Lamp) -> None:
-    """Set a light object up as a lamp, so strong that it lights its target as much as any other lamp does."""
+    """Turn a light object into a lamp that lights its target as strongly as any other lamp does."""
     placed.data.type = lamp.kind.upper()
     data = placed.data
     far = math.dist(lamp.at, lamp.target)
@@ -385,7 +393,7 @@ def _set_lamp(placed: Any, lamp: Lamp) -> None:
 
 
 def _cut(data: Any, lamp: Lamp, gobo: Gobo) -> None:
-    """Let the lamp shine only where its gobo does: a factor on its strength by direction."""
+    """Let the lamp shine only through its gobo: a factor on its strength by direction."""
     ahead = lamp.direction()
     across = np.cross(ahead, [0.13, 0.21, 0.97])
     across /= np.linalg.norm(across)
@@ -403,7 +411,7 @@ def _cut(data: Any, lamp: Lamp, gobo: Gobo) -> None:
     v = nodes.math("DIVIDE", along(c * up - s * across), depth)
 
     def step(value: Any, edge: float, width: float) -> Any:
-        """0 below the edge, 1 above, smooth between."""
+        """Return 0 below the edge and 1 above, with a smooth transition."""
         node = nodes.add("ShaderNodeMapRange", interpolation_type="SMOOTHSTEP")
         for socket, value_or_edge in zip(
             node.inputs, (value, edge - width / 2, edge + width / 2), strict=False

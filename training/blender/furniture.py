@@ -1,4 +1,4 @@
-"""The models of Debian's package sweethome3d-furniture, converted for the asset folder.
+"""Convert the models of Debian's package sweethome3d-furniture for the asset folder.
 
 A catalogue is a folder (or .sh3f archive, a zip) with PluginFurnitureCatalog.properties and OBJ models.
 """
@@ -23,11 +23,11 @@ from dior_rt.training.blender.assets import Entry
 from dior_rt.training.blender.meshes import Finish, Mesh
 
 CATALOGUE: Final = "PluginFurnitureCatalog.properties"
-LARGEST_FILE: Final = 3_000_000  # bytes of an OBJ
+LARGEST_FILE: Final = 3_000_000  # bytes of an OBJ file
 LARGEST_MESH: Final = 60_000  # triangles
 TEXTURE_SIDE: Final = 256
-DARKEST: Final = 0.02  # a lower reflectance shows no light at all
-# Flat markings, plugs, holes in the ground, and parts of buildings that need a wall around them.
+DARKEST: Final = 0.02  # light does not show on a lower reflectance
+# Excluded: flat markings, plugs, holes in the ground, and parts of buildings that need a wall around them.
 LEFT_OUT: Final = re.compile(
     r"pool|jacuzzi|sandpit|plug|switch|socket|arrow|parking|crossing|rails|escalator|elevator|door|window|"
     r"chimney|staircase|smoke detector|antenna|bill |shower|blind|drop",
@@ -40,7 +40,7 @@ PLANTS: Final = re.compile(
 
 
 class Catalogue:
-    """A catalogue's files, in a folder or an archive."""
+    """The files of a catalogue, in a folder or an archive."""
 
     def __init__(self, path: Path) -> None:
         self.name = path.stem
@@ -50,7 +50,7 @@ class Catalogue:
         self._names = {name.lower(): name for name in names}
 
     def read(self, name: str) -> bytes:
-        """A file's bytes. Raises KeyError or OSError where there is none."""
+        """Return a file's bytes. Raises KeyError or OSError where the file does not exist."""
         name = name.lstrip("/")
         if self._folder:
             return (self._folder / name).read_bytes()
@@ -58,7 +58,7 @@ class Catalogue:
         return self._archive.read(self._names[name.lower()])
 
     def items(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """The catalogue's models: number and properties."""
+        """Yield the catalogue's models: number and properties."""
         text = self.read(CATALOGUE).decode("latin1")
         found: dict[int, dict[str, str]] = {}
         for key, number, value in re.findall(r"^(\w+)#(\d+)=(.*)$", text, re.M):
@@ -67,7 +67,7 @@ class Catalogue:
 
 
 def find_catalogues(folder: Path) -> list[Catalogue]:
-    """The catalogues in a folder: .sh3f archives, or folders they were unzipped into. Raises InputError."""
+    """Return the catalogues in a folder: .sh3f archives, or folders of unzipped ones. Raises InputError."""
     try:
         archives = [Catalogue(path) for path in sorted(folder.glob("*.sh3f"))]
         found = archives or [Catalogue(path.parent) for path in sorted(folder.glob(f"*/{CATALOGUE}"))]
@@ -80,14 +80,17 @@ def find_catalogues(folder: Path) -> list[Catalogue]:
 
 @dataclass(frozen=True)
 class Model:
-    """An entry of a catalogue and its mesh."""
+    """An entry of a catalogue, and its mesh."""
 
     entry: Entry
     mesh: Mesh
 
 
 def models(catalogue: Catalogue) -> Iterator[Model]:
-    """The catalogue's models that scenes can use; those that are too large or not readable are left out."""
+    """Yield the catalogue's models that scenes can use.
+
+    Models that are too large or not readable are left out.
+    """
     for number, properties in catalogue.items():
         described = _entry(catalogue, number, properties)
         if described is None:
@@ -180,7 +183,7 @@ def _read_mesh(catalogue: Catalogue, path: str) -> Mesh:
 
 
 def _indices(texts: list[list[str]], count: int) -> NDArray[np.int32]:
-    """0-based indices of an OBJ's, which count from 1, or back from the end when negative."""
+    """Return 0-based indices from an OBJ's, which count from 1, or backwards from the end when negative."""
     index = np.array(texts, np.int64)
     return np.where(index < 0, index + count, index - 1).astype(np.int32)
 
@@ -218,7 +221,9 @@ def _finish(catalogue: Catalogue, folder: PurePosixPath, values: dict[str, list[
 def _read_texture(
     catalogue: Catalogue, folder: PurePosixPath, words: list[str] | None
 ) -> NDArray[np.uint8] | None:
-    """The texture at most TEXTURE_SIDE a side, or None where it is missing: the colour stands in."""
+    """Return the texture with at most TEXTURE_SIDE per side, or None where it is missing: the colour then
+    replaces it.
+    """
     if not words:
         return None
     try:
@@ -234,7 +239,7 @@ def _read_texture(
 
 
 def _turned(mesh: Mesh, rotation: str | None) -> Mesh:
-    """The mesh turned by the catalogue's nine numbers, which are for y up."""
+    """Return the mesh turned by the catalogue's nine numbers, which are for y up."""
     if not rotation:
         return mesh
     to_upright = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
@@ -250,7 +255,7 @@ def _turned(mesh: Mesh, rotation: str | None) -> Mesh:
 
 
 def _fitted(mesh: Mesh, size: tuple[float, float, float]) -> Mesh:
-    """The mesh of that size, standing on the ground, centred on the z axis."""
+    """Return the mesh in that size, standing on the ground, centred on the z axis."""
     scale = np.asarray(size) / np.maximum(mesh.size, 1e-6)
     foot = mesh.low + mesh.size * [0.5, 0.5, 0]
     at = ((mesh.vertices - foot) * scale).astype(np.float32)

@@ -1,4 +1,7 @@
-"""Lamps for a view: seven beside the panorama, three of them near surfaces; each lights something seen."""
+"""Lamps for a view: seven besides the panorama, three of them near surfaces.
+
+Each lights a visible surface.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,15 @@ from dior_rt.training.blender.scene import BlenderScene, Camera, Gobo, GoboKind,
 
 LAMPS = 7
 TRIES = 12
-LEAST_LIT = 0.06  # the share of the probe's rays that a lamp has to reach
+LEAST_LIT = 0.06  # the share of the probe's rays that a lamp must reach
 GOBO_SHARE = 0.3
 
 
 def lamps(scene: BlenderScene, camera: Camera, stage: Stage, hits: Hits, rng: Generator) -> list[Lamp]:
-    """Choose the view's lamps; fewer than LAMPS where no more reach enough of what is seen."""
+    """Choose the view's lamps.
+
+    There are fewer than LAMPS where no more reach enough of the visible surfaces.
+    """
     near: list[Callable[..., Lamp | None]] = [candle, rim, torch]
     far: list[Callable[..., Lamp | None]] = [key, key, window_light, spot, spot, sun, sun, top]
     chosen: list[Lamp] = []
@@ -35,7 +41,7 @@ def lamps(scene: BlenderScene, camera: Camera, stage: Stage, hits: Hits, rng: Ge
 
 
 def reaches(lamp: Lamp, stage: Stage, hits: Hits) -> float:
-    """The share of what is seen that a lamp's middle shines on."""
+    """Return the share of the visible surfaces that a lamp's middle shines on."""
     points, normals = hits.at[hits.hit], hits.normal[hits.hit]
     if lamp.kind == "sun":
         ways, far = np.broadcast_to(-lamp.direction(), points.shape), np.full(len(points), 1e3)
@@ -56,14 +62,14 @@ def reaches(lamp: Lamp, stage: Stage, hits: Hits) -> float:
 
 
 def candle(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A small bare light just above a surface that is seen."""
+    """Return a small bare light just above a visible surface."""
     point, normal = _seen(scene, hits, rng)
     at = point + normal * scene.span * rng.uniform(0.06, 0.35) + rng.normal(0, 0.03, 3) * scene.span
     return _lamp(scene, "point", at, point, rng.uniform(0.004, 0.03) * scene.span, "candle", rng)
 
 
 def rim(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A light behind the subject, seen from the camera, that lights its edges."""
+    """Return a light behind the subject, seen from the camera, that lights its edges."""
     middle = _middle(scene, hits)
     behind = middle - np.asarray(camera.at)
     behind /= np.linalg.norm(behind)
@@ -74,7 +80,7 @@ def rim(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp
 
 
 def torch(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A narrow cone on one place, from nearby."""
+    """Return a narrow cone on one place, from nearby."""
     point, normal = _seen(scene, hits, rng)
     way = normal + rng.normal(0, 0.5, 3) + [0, 0, 0.3]
     at = point + way / np.linalg.norm(way) * scene.span * rng.uniform(0.4, 1.0)
@@ -91,7 +97,7 @@ def torch(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> La
 
 
 def key(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A photographer's main light: beside the camera, above, hard or soft."""
+    """Return a photographer's main light: beside the camera, above, hard or soft."""
     middle = _middle(scene, hits)
     at = middle + scene.span * _around(camera, middle, rng, (0.2, 1.9), (0.1, 1.0)) * rng.uniform(0.8, 1.8)
     kind = "area" if rng.random() < 0.5 else "point"
@@ -100,14 +106,14 @@ def key(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp
 
 
 def window_light(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A large soft light from one side."""
+    """Return a large soft light from one side."""
     middle = _middle(scene, hits)
     at = middle + scene.span * _around(camera, middle, rng, (0.9, 2.2), (-0.1, 0.5)) * rng.uniform(1.0, 1.8)
     return _lamp(scene, "area", at, middle, rng.uniform(0.6, 1.5) * scene.span, "window", rng)
 
 
 def spot(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A cone on a place that is seen, from any side."""
+    """Return a cone on a visible place, from any side."""
     point, normal = _seen(scene, hits, rng)
     way = normal + rng.normal(0, 0.7, 3) + [0, 0, 0.7]
     at = point + way / np.linalg.norm(way) * scene.span * rng.uniform(0.9, 2.0)
@@ -116,14 +122,14 @@ def spot(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lam
 
 
 def sun(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """Parallel light with hard shadows."""
+    """Return parallel light with hard shadows."""
     middle = _middle(scene, hits)
     way = _around(camera, middle, rng, (0.2, 2.4), (0.15, 1.3))
     return Lamp("sun", triple(middle + 10 * way), triple(middle), float(rng.uniform(0.3, 4)), "sun")
 
 
 def top(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp | None:
-    """A light above, as ceiling lamps are."""
+    """Return a light above, like a ceiling lamp."""
     middle = _middle(scene, hits)
     at = middle + scene.span * np.array([*rng.normal(0, 0.5, 2), rng.uniform(0.7, 1.6)])
     kind = "point" if rng.random() < 0.5 else "area"
@@ -131,7 +137,7 @@ def top(scene: BlenderScene, camera: Camera, hits: Hits, rng: Generator) -> Lamp
 
 
 def _seen(scene: BlenderScene, hits: Hits, rng: Generator) -> tuple[Vector, Vector]:
-    """A point that is seen and its normal: on a thing more often than on the shell."""
+    """Return a visible point and its normal, on an object more often than on the shell."""
     shell = np.array([thing.role == "shell" for thing in scene.things])[np.maximum(hits.thing, 0)]
     weight = np.where(hits.hit, np.where(shell, 0.3, 1.0), 0)
     index = rng.choice(len(weight), p=weight / weight.sum())
@@ -139,7 +145,7 @@ def _seen(scene: BlenderScene, hits: Hits, rng: Generator) -> tuple[Vector, Vect
 
 
 def _middle(scene: BlenderScene, hits: Hits) -> Vector:
-    """The middle of what is seen of the subject."""
+    """Return the middle of the visible part of the subject."""
     subject = np.array([thing.role == "subject" for thing in scene.things])[np.maximum(hits.thing, 0)]
     return np.median(hits.at[hits.hit & subject], axis=0)
 
@@ -147,7 +153,9 @@ def _middle(scene: BlenderScene, hits: Hits) -> Vector:
 def _around(
     camera: Camera, middle: Vector, rng: Generator, turn: tuple[float, float], lift: tuple[float, float]
 ) -> Vector:
-    """A unit vector from the middle, turned away from the camera's direction to either side, lifted."""
+    """Return a unit vector from the middle, turned away from the camera's direction to either side, and
+    lifted.
+    """
     back = np.asarray(camera.at) - middle
     angle = math.atan2(back[1], back[0]) + rng.choice([-1, 1]) * rng.uniform(*turn)
     up = rng.uniform(*lift)
@@ -164,7 +172,7 @@ def _lamp(
     rng: Generator,
     cone: float = 60.0,
 ) -> Lamp | None:
-    """The lamp where it is free to stand, at times behind a gobo."""
+    """Return the lamp where it has room to stand, sometimes behind a gobo."""
     if not scene.free(np.asarray(at), margin=max(0.02, size if kind == "point" else 0.0)):
         return None
     gobo = (

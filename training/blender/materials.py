@@ -52,7 +52,7 @@ SOFT: Final = (
 
 
 def tile(rng: Generator, assets: Assets, split: Split, repeats: float, *kinds: str) -> Finish:
-    """A surface tile projected at about `repeats` a metre."""
+    """Return a surface tile projected at about `repeats` per metre."""
     chosen = assets.surfaces(split, *kinds) or assets.surfaces(split)
     index = chosen[rng.integers(len(chosen))]
     kind = assets.kinds[index]
@@ -72,7 +72,7 @@ def tile(rng: Generator, assets: Assets, split: Split, repeats: float, *kinds: s
 
 
 def paint(rng: Generator) -> Finish:
-    """Plain paint: mostly near-neutral, at times of a colour, seldom dark."""
+    """Return plain paint: mostly near-neutral, sometimes coloured, seldom dark."""
     if rng.random() < 0.65:
         value = rng.uniform(0.3, 0.85) if rng.random() < 0.85 else rng.uniform(0.03, 0.3)
         hue, saturation = (
@@ -86,13 +86,13 @@ def paint(rng: Generator) -> Finish:
 
 
 def metal(rng: Generator) -> Finish:
-    """Polished or brushed metal: steel, brass, copper, black."""
+    """Return polished or brushed metal: steel, brass, copper, black."""
     colors = ((0.6, 0.6, 0.62), (0.8, 0.6, 0.25), (0.75, 0.4, 0.25), (0.85, 0.85, 0.85), (0.1, 0.1, 0.11))
     return Finish(color=colors[rng.integers(5)], metallic=1.0, roughness=float(rng.uniform(0.06, 0.45)))
 
 
 def glass(rng: Generator) -> Finish:
-    """Clear or lightly coloured glass with a sharp reflection."""
+    """Return clear or lightly coloured glass with a sharp reflection."""
     tint = 1 - rng.uniform(0, 0.3, 3) * (rng.random() < 0.4)
     return Finish(
         color=triple(tint),
@@ -102,7 +102,7 @@ def glass(rng: Generator) -> Finish:
 
 
 def any_finish(rng: Generator, assets: Assets, split: Split, repeats: float) -> Finish:
-    """A finish for a solid."""
+    """Return a finish for a solid."""
     pick = rng.random()
     if pick < 0.5:
         return tile(rng, assets, split, repeats)
@@ -110,7 +110,7 @@ def any_finish(rng: Generator, assets: Assets, split: Split, repeats: float) -> 
 
 
 def repainted(rng: Generator, mesh: Mesh) -> Mesh:
-    """At times a model in other colours and gloss, so that few models become many."""
+    """Return a model, sometimes in other colours and gloss, so that a few models give many."""
     if rng.random() < 0.5:
         return mesh
     tints = 1 + rng.normal(0, 0.12, (len(mesh.finishes), 3))

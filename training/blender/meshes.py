@@ -13,17 +13,17 @@ Triple = tuple[float, float, float]
 
 
 def triple(values: ArrayLike) -> Triple:
-    """Three numbers as plain floats."""
+    """Return three numbers as plain floats."""
     x, y, z = np.asarray(values, float).tolist()
     return x, y, z
 
 
 @dataclass(frozen=True)
 class Finish:
-    """How a surface reflects.
+    """The finish of a surface, which determines how it reflects.
 
     color: linear RGB, a factor on the texture where there is one. texture: (h, w, 3 or 4) uint8 sRGB, row 0
-    on top; a fourth channel cuts out. box: the texture is projected along the axes at `box` repeats a
+    on top; a fourth channel cuts out. box: the texture is projected along the axes at `box` repeats per
     metre; 0 uses the mesh's uv. glass: the share of light that passes straight through. bump: strength of a
     relief made from the texture.
     """
@@ -39,10 +39,10 @@ class Finish:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """vertices: (N, 3). faces: (M, 3) indices. uv: (M, 3, 2) a corner, or None. slots: (M,) index into
-    finishes.
+    """A triangle mesh with its finishes.
 
-    smooth: the angle in degrees below which neighbouring faces share their shading.
+    vertices: (N, 3). faces: (M, 3) indices. uv: (M, 3, 2) per corner, or None. slots: (M,) index into
+    finishes. smooth: the angle in degrees below which neighbouring faces share their shading.
     """
 
     vertices: Floats
@@ -61,12 +61,12 @@ class Mesh:
         return np.ptp(self.vertices, axis=0)
 
     def finished(self, finish: Finish) -> Mesh:
-        """The same shape, all in one finish."""
+        """Return the same shape, all in one finish."""
         return replace(self, slots=np.zeros(len(self.faces), np.int32), finishes=(finish,))
 
 
 def solid(vertices: object, faces: object, smooth: float = 40.0) -> Mesh:
-    """A mesh of one grey finish and no uv."""
+    """Return a mesh with one grey finish and no uv."""
     corners = np.asarray(faces, np.int32)
     return Mesh(
         np.asarray(vertices, np.float32), corners, None, np.zeros(len(corners), np.int32), (Finish(),), smooth
@@ -74,14 +74,14 @@ def solid(vertices: object, faces: object, smooth: float = 40.0) -> Mesh:
 
 
 def box(size: tuple[float, float, float]) -> Mesh:
-    """A box that stands on the ground, centred on the z axis."""
+    """Return a box that stands on the ground, centred on the z axis."""
     corners = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)]) * size
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     return solid(corners, [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
 
 
 def grid(points: NDArray[np.floating], closed: bool = False) -> Mesh:
-    """A surface through (rows, columns, 3) points; closed joins the last column to the first."""
+    """Return a surface through (rows, columns, 3) points. closed: whether the last column joins the first."""
     rows, columns = points.shape[:2]
     index = np.arange(rows * columns).reshape(rows, columns)
     if closed:
@@ -92,25 +92,25 @@ def grid(points: NDArray[np.floating], closed: bool = False) -> Mesh:
 
 
 def lathe(profile: object, sides: int = 40) -> Mesh:
-    """A solid of revolution about z from (radius, height) pairs, lowest first."""
+    """Return a solid of revolution about z from (radius, height) pairs, lowest first."""
     r, z = np.asarray(profile, float).T[:, :, None]
     turn = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None]
     return grid(np.stack([r * np.cos(turn), r * np.sin(turn), np.broadcast_to(z, (len(z), sides))], -1), True)
 
 
 def cylinder(radius: float, height: float) -> Mesh:
-    """A closed cylinder that stands on the ground."""
+    """Return a closed cylinder that stands on the ground."""
     return lathe([(0.0, 0.0), (radius, 0.0), (radius, height), (0.0, height)])
 
 
 def ball(radius: float) -> Mesh:
-    """A sphere that stands on the ground."""
+    """Return a sphere that stands on the ground."""
     angle = np.linspace(0, np.pi, 24)
     return lathe(np.stack([radius * np.sin(angle), radius * (1 - np.cos(angle))], -1))
 
 
 def tube(path: object, radius: float, sides: int = 10) -> Mesh:
-    """A round wire along (n, 3) points."""
+    """Return a round wire along (n, 3) points."""
     at = np.asarray(path, float)
     along = np.gradient(at, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -122,14 +122,14 @@ def tube(path: object, radius: float, sides: int = 10) -> Mesh:
 
 
 def ring(radius: float, thickness: float) -> Mesh:
-    """A torus lying on the ground."""
+    """Return a torus lying on the ground."""
     turn = np.linspace(0, 2 * np.pi, 40)
     path = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full_like(turn, thickness)], -1)
     return tube(path, thickness, 14)
 
 
 def cloth(width: float, height: float, rng: Generator) -> Mesh:
-    """A hanging sheet with folds, its lower edge on the ground, facing -y."""
+    """Return a hanging sheet with folds, its lower edge on the ground, facing -y."""
     u, v = np.meshgrid(np.linspace(-0.5, 0.5, 80), np.linspace(0, 1, 12))
     depth = sum(
         rng.uniform(0.1, 0.5) * np.sin(k * 6.28 * u + rng.uniform(0, 6.28) + rng.normal(0, 0.6) * v) / k**0.5
@@ -139,7 +139,7 @@ def cloth(width: float, height: float, rng: Generator) -> Mesh:
 
 
 def rock(radius: float, rng: Generator) -> Mesh:
-    """A lumpy ball standing on the ground."""
+    """Return a lumpy ball standing on the ground."""
     mesh = ball(radius)
     v = mesh.vertices - [0, 0, radius]
     wave = rng.normal(0, 1.6 / radius, (6, 3))
@@ -149,7 +149,7 @@ def rock(radius: float, rng: Generator) -> Mesh:
 
 
 def vessel(height: float, rng: Generator) -> Mesh:
-    """A vase, bottle, bowl or cup with a wall: a smooth random profile, up outside and down inside."""
+    """Return a vase, bottle, bowl or cup with a wall: a smooth random profile, up outside and down inside."""
     t = np.linspace(0, 1, 18)
     knots = rng.uniform(0.12, 0.5, 5) * rng.choice([0.7, 1, 1.5])
     outside = np.interp(t, np.linspace(0, 1, 5), knots)
@@ -160,7 +160,7 @@ def vessel(height: float, rng: Generator) -> Mesh:
 
 
 def leaves(height: float, rng: Generator) -> Mesh:
-    """A plant of thin bent blades."""
+    """Return a plant of thin bent blades."""
     parts = []
     for _ in range(int(rng.integers(8, 40))):
         turn, bend, reach = rng.uniform(0, 6.28), rng.uniform(0.2, 1.0), height * rng.uniform(0.6, 1.1)
@@ -175,7 +175,7 @@ def leaves(height: float, rng: Generator) -> Mesh:
 
 
 def join(parts: list[Mesh]) -> Mesh:
-    """One mesh of several without uv, in the first one's finish."""
+    """Return one mesh of several without uv, in the first one's finish."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
     return replace(

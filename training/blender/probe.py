@@ -1,4 +1,4 @@
-"""What a camera sees, from a few hundred rays: enough to judge a picture's composition and to place lamps."""
+"""Find what a camera sees with a few hundred rays, to judge a picture's composition and to place lamps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SIDE = 20
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays end. hit: (N,) whether they do. at, normal: (N, 3). thing: (N,) index, -1 for none."""
+    """The hits of rays. hit: (N,) whether they hit. at, normal: (N, 3). thing: (N,) index, -1 for none."""
 
     hit: NDArray[np.bool_]
     at: Vector
@@ -24,13 +24,13 @@ class Hits:
 
 
 class Stage(Protocol):
-    """A scene that was built and can be asked what rays hit."""
+    """A built scene that reports what rays hit."""
 
     def cast(self, origin: Vector, directions: Vector, reach: float = 1e6) -> Hits: ...
 
 
 def look(stage: Stage, camera: Camera) -> Hits:
-    """What the camera sees, on a grid of SIDE x SIDE rays; normals face the camera."""
+    """Return what the camera sees, on a grid of SIDE x SIDE rays. Normals face the camera."""
     rays = camera.rays(SIDE)
     hits = stage.cast(np.asarray(camera.at), rays)
     facing = np.sign(-(hits.normal * rays).sum(1, keepdims=True))
@@ -38,10 +38,11 @@ def look(stage: Stage, camera: Camera) -> Hits:
 
 
 def score(scene: BlenderScene, camera: Camera, hits: Hits) -> float:
-    """Judge a composition; above 0 it is a picture worth taking, and more is better.
+    """Return the score of a composition. Above 0 it is a picture worth taking, and more is better.
 
-    Wanted: the subject takes 6 to 60 % of the frame and not only its rim; no single thing of the shell
-    fills it; nothing stands right before the lens; more than one depth and one orientation.
+    A good picture meets these conditions: the subject fills 6 to 60 % of the frame and not only its rim; no
+    single object of the shell fills it; nothing stands right before the lens; there is more than one depth
+    and one orientation.
     """
     roles = np.array([thing.role for thing in scene.things])
     seen = roles[np.maximum(hits.thing, 0)]

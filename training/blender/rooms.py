@@ -1,4 +1,4 @@
-"""Furnished rooms, with windows in some walls and things on the furniture."""
+"""Furnished rooms, with windows in some walls and objects on the furniture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WALL = 0.1
 
 
 def room(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderScene:
-    """A room open towards the camera, furnished, with one piece in the middle of attention."""
+    """Return a furnished room open towards the camera, with one piece as the subject."""
     rng = stock.rng
     width, depth, height = rng.uniform(3, 5.5), rng.uniform(3, 5), rng.uniform(2.4, 3.1)
     things: list[Thing] = []
@@ -75,7 +75,7 @@ def pierced(
     rng: np.random.Generator,
     near: float = 0.0,
 ) -> None:
-    """Add a wall with a window: four boxes around the hole, a frame with bars, at times a curtain."""
+    """Add a wall with a window: four boxes around the hole, a frame with bars, sometimes a curtain."""
     wide, tall = min(rng.uniform(0.8, 2.2), length * 0.6), rng.uniform(0.9, 1.7)
     sill = rng.uniform(0.2, max(0.25, height - tall - 0.3))
     reach = max(length / 2 - wide / 2 - 0.3, 0)
@@ -143,7 +143,7 @@ def _furniture(stock: Stock, things: list[Thing], floor: Floor, width: float, de
 
 
 def _on_top(stock: Stock, things: list[Thing], thing: Thing, top: float) -> None:
-    """Stand up to three small things on a piece of furniture."""
+    """Stand up to three small objects on a piece of furniture."""
     rng = stock.rng
     if not 0.25 < top < 1.3 or rng.random() < 0.3:
         return
@@ -159,7 +159,7 @@ def _on_top(stock: Stock, things: list[Thing], thing: Thing, top: float) -> None
 
 
 def _on_walls(stock: Stock, things: list[Thing], width: float, depth: float, height: float) -> None:
-    """Hang pictures on the back wall, and at times a curtain before it."""
+    """Hang pictures on the back wall, and sometimes a curtain before it."""
     rng = stock.rng
     y = depth / 2 - 0.02
     for _ in range(int(rng.integers(0, 3))):

@@ -1,7 +1,6 @@
-"""What a scene is: things, a panorama around them, cameras to choose from; and the lamps that views add.
+"""The parts of a scene: objects, a panorama around them, candidate cameras, and the lamps that views add.
 
-Everything is plain data in metres, z up. A scene's things stand where the description says; `cycles` builds
-it.
+Everything is plain data in metres, z up. The description places a scene's objects; `cycles` builds it.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ GoboKind = Literal["flag", "slats", "window", "leaves"]
 class Thing:
     """A mesh in its place.
 
-    role: "shell" is ground, walls and ceiling; the "subject" is what the picture is about. turn: about z, in
+    role: "shell" is ground, walls and ceiling; "subject" is the main object of the picture. turn: about z, in
     radians, after `tilt` about x. scale: a factor on the mesh's size.
     """
 
@@ -37,7 +36,7 @@ class Thing:
     role: Role = "thing"
 
     def matrix(self) -> Vector:
-        """The 4 x 4 matrix from the mesh's space to the scene's."""
+        """Return the 4 x 4 matrix from the mesh's space to the scene's."""
         c, s, ct, st = (f(a) for a in (self.turn, self.tilt) for f in (math.cos, math.sin))
         about_z = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         about_x = np.array([[1, 0, 0], [0, ct, -st], [0, st, ct]])
@@ -47,14 +46,14 @@ class Thing:
         return placed
 
     def corners(self) -> Vector:
-        """(8, 3) the corners of the thing's box."""
+        """Return (8, 3) the corners of the object's box."""
         low, size = self.mesh.low, self.mesh.size
         unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
         matrix = self.matrix()
         return (low + unit * size) @ matrix[:3, :3].T + matrix[:3, 3]
 
     def holds(self, point: Vector, margin: float) -> bool:
-        """Whether a point lies in the thing's box, or nearer to it than `margin`."""
+        """Return whether a point lies in the object's box, or within `margin` of it."""
         matrix = self.matrix()
         local = np.linalg.solve(matrix[:3, :3], point - matrix[:3, 3])
         slack = margin / self.scale
@@ -72,7 +71,7 @@ class Camera:
     roll: float = 0.0
 
     def axes(self) -> Vector:
-        """(3, 3) rows: the camera's right, up and backward directions in the scene."""
+        """Return (3, 3) rows: the camera's right, up and backward directions in the scene."""
         back = np.subtract(self.at, self.target).astype(float)
         back /= np.linalg.norm(back)
         right = np.cross([0, 0, 1.0], back)
@@ -82,7 +81,7 @@ class Camera:
         return np.stack([c * right + s * up, c * up - s * right, back])
 
     def rays(self, side: int) -> Vector:
-        """(side * side, 3) unit directions through a grid of the picture, row by row from the top."""
+        """Return (side * side, 3) unit directions through a grid of the picture, row by row from the top."""
         reach = math.tan(math.radians(self.fov / 2))
         steps = (np.arange(side) + 0.5) / side * 2 - 1
         x, y = np.meshgrid(steps * reach, -steps * reach)
@@ -124,7 +123,7 @@ class Lamp:
     gobo: Gobo | None = None
 
     def direction(self) -> Vector:
-        """The unit vector along which it shines."""
+        """Return the unit vector along which it shines."""
         along = np.subtract(self.target, self.at).astype(float)
         return along / np.linalg.norm(along)
 
@@ -139,7 +138,10 @@ class Panorama:
 
 @dataclass(frozen=True, eq=False)
 class BlenderScene:
-    """Things under a panorama. cameras: candidates, best first. span: size of what matters, in metres."""
+    """Objects under a panorama.
+
+    cameras: candidates, best first. span: size of the important part, in metres.
+    """
 
     kind: str
     seed: int
@@ -148,10 +150,10 @@ class BlenderScene:
     panorama: Panorama
     cameras: tuple[Camera, ...]
     span: float
-    inside: tuple[Vector, Vector] | None = None  # the room's corners, where lamps have to stay
+    inside: tuple[Vector, Vector] | None = None  # the room's corners, which the lamps must stay within
 
     def free(self, point: Vector, margin: float = 0.03) -> bool:
-        """Whether a lamp fits at a point: in the room, above the ground, in no thing's box."""
+        """Return whether a lamp fits at a point: in the room, above the ground, in no object's box."""
         if point[2] < 0.02 or (
             self.inside
             and (np.any(point < self.inside[0] + margin) or np.any(point > self.inside[1] - margin))

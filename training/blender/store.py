@@ -40,10 +40,10 @@ Half = NDArray[np.float16]
 
 @dataclass(frozen=True)
 class ViewHead:
-    """What a view's file says in words.
+    """The description in a view's file.
 
-    lights: one object a light, in the order of the images: kind, role, gobo; kind "world" comes last.
-    roles: of the things, in the order of their ids. camera: at, fov in degrees, axes (rows right, up,
+    lights: one object per light, in the order of the images: kind, role, gobo; kind "world" comes last.
+    roles: those of the objects, in the order of their ids. camera: at, fov in degrees, axes (rows right, up,
     backward).
     """
 
@@ -60,7 +60,7 @@ class ViewHead:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One scene from one camera; arrays as the module describes them."""
+    """One scene from one camera, with arrays as the module describes them."""
 
     images: Half
     lumi: Half
@@ -73,7 +73,7 @@ class View:
     head: ViewHead
 
     def lumi_maps(self) -> Half:
-        """All Lumi maps in colour: (K, H, W, 3), in the order of the images."""
+        """Return all Lumi maps in colour: (K, H, W, 3), in the order of the images."""
         lamps = np.repeat(self.lumi[..., None], 3, axis=-1)
         return lamps if self.world_lumi is None else np.concatenate([lamps, self.world_lumi[None]])
 
@@ -89,7 +89,7 @@ def save_view(path: Path, view: View) -> None:
 
 
 def load_view(path: Path) -> View:
-    """Read what `save_view` wrote. Raises InputError for a file that is cut short, or something else."""
+    """Read what `save_view` wrote. Raises InputError for a file that is cut short, or of another kind."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             described = json.loads(str(stored["head"]))
@@ -107,5 +107,5 @@ def load_view(path: Path) -> View:
 
 
 def half(raster: NDArray[np.floating]) -> Half:
-    """Half floats within their range; NaN becomes 0."""
+    """Return half floats within their range. NaN becomes 0."""
     return np.clip(np.nan_to_num(raster), -HALF_MAX, HALF_MAX).astype(np.float16)

@@ -1,4 +1,4 @@
-"""Table tops and products: small things near the camera, on a table, a sweep or a shelf."""
+"""Table tops and products: small objects near the camera, on a table, a sweep or a shelf."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dior_rt.training.blender.scene import BlenderScene, Panorama, Thing
 
 
 def table(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderScene:
-    """One to seven things on a table; behind them a wall, a studio sweep, or the panorama."""
+    """Return one to seven objects on a table. Behind them is a wall, a studio sweep, or the panorama."""
     rng = stock.rng
     things: list[Thing] = []
     _ground(stock, things)
@@ -35,7 +35,7 @@ def table(stock: Stock, seed: int, panorama: Panorama, views: int) -> BlenderSce
 
 
 def _hero(stock: Stock, height: float) -> tuple[meshes.Mesh, float]:
-    """A product: a small model, a miniature of a large one, or a solid."""
+    """Return a product: a small model, a miniature of a large one, or a solid."""
     rng = stock.rng
     pick = rng.random()
     if pick < 0.2:
@@ -51,7 +51,7 @@ def _hero(stock: Stock, height: float) -> tuple[meshes.Mesh, float]:
 def _ground(stock: Stock, things: list[Thing]) -> None:
     rng = stock.rng
     pick = rng.random()
-    if pick < 0.3:  # a sweep: the table bends up into the background
+    if pick < 0.3:  # a sweep: the table curves up into the background
         radius, far = rng.uniform(0.3, 0.8), rng.uniform(0.7, 1.4)
         turn = np.linspace(0, np.pi / 2, 16)
         y = np.concatenate([[-3, 0], far + radius * np.sin(turn), [far + radius]])

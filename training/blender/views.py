@@ -1,4 +1,6 @@
-"""From scenes to files: choose cameras and lamps, shoot, denoise, bring every light to one mean, store."""
+"""Turn scenes into files: choose cameras and lamps, shoot, denoise, bring every light to one mean, and
+store.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,18 @@ if TYPE_CHECKING:
     from dior_rt.training.blender.cycles import ShootOptions, Shot, Studio
 
 RENDERER: Final = "blender-3"
-VIEWS: Final = 2  # a scene
-GOOD: Final = 0.35  # the score at which no further camera is looked through
+VIEWS: Final = 2  # per scene
+GOOD: Final = 0.35  # the score at which the search for further cameras stops
 LEAST_LIGHTS: Final = 3
-LEAST_LIT: Final = 0.05  # the share of a view's pixels that a light has to reach
-LIT: Final = 0.1  # of a light's mean, from which a pixel counts as reached
+LEAST_LIT: Final = 0.05  # the share of a view's pixels that a light must reach
+LIT: Final = 0.1  # the share of a light's mean at which a pixel counts as reached
 
 Raster = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to render. shard: (index, count), this process's share of the scenes."""
+    """The scenes to render. shard: (index, count), this process's share of the scenes."""
 
     out: Path
     assets: Path
@@ -46,7 +48,7 @@ class Job:
 
 
 def numbers(job: Job) -> list[int]:
-    """Seeds of this process's scenes; sets of different --seed share none."""
+    """Return the seeds of this process's scenes. Sets of different --seed share none."""
     index, count = job.shard
     return [job.seed * 1_000_000 + k for k in range(index, job.scenes, count)]
 
@@ -54,7 +56,7 @@ def numbers(job: Job) -> list[int]:
 def render_views(
     job: Job, options: ShootOptions, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> None:
-    """Render the scenes that are not there yet to `out/<split>-<seed>-<view>.npz`, VIEWS files each.
+    """Render the missing scenes to `out/<split>-<seed>-<view>.npz`, VIEWS files each.
 
     A scene without a picture worth taking leaves an empty file `<split>-<seed>.done`, so that a later run
     does not try again. Raises InputError where the assets cannot be read or nothing can be written.
@@ -80,7 +82,7 @@ def render_views(
 
 
 def views(described: BlenderScene, studio: Studio, count: int) -> list[View]:
-    """The scene's views that are worth keeping, at most `count`."""
+    """Return the scene's views that are worth keeping, at most `count`."""
     rng = np.random.default_rng([described.seed, 7])
     found = []
     for k, camera in enumerate(cameras(described, studio, count)):
@@ -94,7 +96,9 @@ def views(described: BlenderScene, studio: Studio, count: int) -> list[View]:
 
 
 def cameras(described: BlenderScene, studio: Studio, count: int) -> list[Camera]:
-    """The best candidates: the first that are good, else the best of all; none where none is a picture."""
+    """Return the best candidates: the first that are good, else the best of all, or none where none is a
+    picture.
+    """
     rated: list[tuple[float, Camera]] = []
     for camera in described.cameras:
         value = score(described, camera, look(studio, camera))
@@ -108,7 +112,7 @@ def cameras(described: BlenderScene, studio: Studio, count: int) -> list[Camera]
 def finish(
     described: BlenderScene, camera: Camera, chosen: list[Lamp], shot: Shot, index: int
 ) -> View | None:
-    """Denoise a shot and keep the lights that reach enough of it; None where too few do."""
+    """Denoise a shot and keep the lights that reach enough of it. Returns None where too few do."""
     seen = shot.sky < 0.5
     lights = [
         *(
@@ -149,7 +153,7 @@ def finish(
 
 
 def head(described: BlenderScene, camera: Camera, lights: list[dict[str, Any]], index: int) -> ViewHead:
-    """What the file says about a view in words."""
+    """Return the description of a view for its file."""
     return ViewHead(
         seed=described.seed,
         view=index,
@@ -164,7 +168,7 @@ def head(described: BlenderScene, camera: Camera, lights: list[dict[str, Any]], 
 
 
 def reaches_enough(lumi: Raster, seen: NDArray[np.bool_]) -> bool:
-    """Whether a light shines on LEAST_LIT of the view's surfaces."""
+    """Return whether a light shines on LEAST_LIT of the view's surfaces."""
     if not seen.any():
         return False
     value = lumi.mean(2)[seen]

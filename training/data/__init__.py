@@ -1,1 +1,1 @@
-"""Training data: renders, the random camera, triplets made of both, and real photos."""
+"""Training data: renders, the random camera, triplets from both, and real photos."""

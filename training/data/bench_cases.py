@@ -1,4 +1,4 @@
-"""Cases to measure presets with: pairs mixed from held-out renders, and strokes of their light."""
+"""Make the cases that measure presets: pairs mixed from held-out renders, and strokes of their light."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from dior_rt.training.data.triplets import interest, load_views, pair
 
 
 def from_renders(folder: Path, count: int) -> list[Case]:
-    """Pairs mixed from a folder of renders; half replace all lights, half change one, and of each half the
-    light is given whole or as strokes. Needs dior-rt[train]. Raises InputError for too few renders."""
+    """Return pairs mixed from a folder of renders.
+
+    Half replace all lights, and half change one. In each half the light is passed whole or as strokes. Needs
+    dior-rt[train]. Raises InputError for too few renders.
+    """
     views = load_views(folder)
     if len(views) < count:
         raise InputError(f"{folder} has {len(views)} views, fewer than {count}.")

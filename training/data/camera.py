@@ -1,4 +1,4 @@
-"""A camera between a rendered scene and the photo: what carries renders towards real pictures.
+"""A camera between a rendered scene and the photo, which makes renders resemble real pictures.
 
     linear light -> optics (blur) -> sensor (noise) -> picture style (develop) -> sharpening -> JPEG -> 8 bits
 
@@ -22,10 +22,10 @@ from dior_rt.kernels.color import linear_to_srgb
 
 Raster = NDArray[np.float32]
 
-PLAIN_SHARE = 1 / 3  # of cameras, and of white balances: none
+PLAIN_SHARE = 1 / 3  # share of cameras, and of white balances, that change nothing
 LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)  # ITU-R BT.709
-SHARPENING_BLUR = 0.7  # cells; wider, three taps would turn the finest detail round
-ZERO = 128  # the code that stands for no error
+SHARPENING_BLUR = 0.7  # cells; with a wider blur, three taps would invert the finest detail
+ZERO = 128  # the code of a zero error
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,9 @@ class Camera:
     pixels: float = 3.0
 
     def develop(self, linear: Raster) -> Raster:
-        """The picture of linear light (H, W, 3): float32, sRGB-encoded, in 0..1, not rounded.
+        """Return the picture of linear light (H, W, 3): float32, sRGB-encoded, in 0..1, not rounded.
 
-        Each channel rises with its own light, and greys stay grey. Light beyond 0..1 is clipped.
+        Each channel rises with its light, and greys stay grey. Light outside 0..1 is clipped.
         """
         v = linear_to_srgb(np.clip(linear, 0, 1)).astype(np.float32) ** np.float32(self.gamma)
         v += np.float32(self.contrast) * (v * v * (3 - 2 * v) - v)
@@ -69,7 +69,7 @@ class Camera:
         return np.clip(v, 0, 1)
 
     def shot(self, linear: Raster, rng: Generator) -> Raster:
-        """A photo taken of linear light (H, W, 3): float32, sRGB-encoded, multiples of 1/255 in 0..1."""
+        """Return a photo of linear light (H, W, 3): float32, sRGB-encoded, multiples of 1/255 in 0..1."""
         seen = softened(np.asarray(linear, np.float32), self.blur)
         deviation = np.sqrt(np.float32(self.shot_noise) * seen.clip(0, 1) + np.float32(self.read_noise**2))
         photo = self.develop(seen + deviation * rng.standard_normal(seen.shape, np.float32))
@@ -80,12 +80,14 @@ class Camera:
 
 
 def random_camera(rng: Generator) -> Camera:
-    """A camera such as people own: mild in style, and a third of the time plain sRGB without a flaw."""
+    """Return a camera of a common kind: mild in style, and in a third of the cases plain sRGB without
+    flaws.
+    """
     if rng.uniform() < PLAIN_SHARE:
         return Camera()
-    # A pixel's noise as Brooks et al. fitted it to real sensors (Unprocessing Images for Learned Raw
-    # Denoising, CVPR 2019). Demosaicing and denoising leave it alike over some 2 x 2 pixels, so that a cell,
-    # 4 to 16 pixels wide, averages 4 to 64 independent draws.
+    # A pixel's noise follows Brooks et al., who fitted it to real sensors (Unprocessing Images for Learned
+    # Raw Denoising, CVPR 2019). Demosaicing and denoising make it similar over about 2 x 2 pixels, so that a
+    # cell, 4 to 16 pixels wide, averages 4 to 64 independent draws.
     shot = 10 ** rng.uniform(-4, math.log10(0.012))
     read = 10 ** ((2.18 * math.log10(shot) + 1.2 + rng.normal(0, 0.26)) / 2)
     draws = 4 ** rng.uniform(1, 3)
@@ -104,9 +106,9 @@ def random_camera(rng: Generator) -> Camera:
 
 
 def white_balance(rng: Generator) -> Raster:
-    """(3,) gains for all of a pair's linear rasters: what a camera's white balance left or added.
+    """Return (3,) gains for all linear rasters of a pair: the remaining error of a camera's white balance.
 
-    Warm or cool for the most part, a little green or magenta; white keeps its luminance. A third are none.
+    It is mostly warm or cool, slightly green or magenta. White keeps its luminance. A third have no error.
     """
     if rng.uniform() < PLAIN_SHARE:
         return np.ones(3, np.float32)
@@ -116,7 +118,10 @@ def white_balance(rng: Generator) -> Raster:
 
 
 def softened(raster: Raster, deviation: float) -> Raster:
-    """(H, W, C) under the three taps of that standard deviation in cells, both ways; edges go on outwards."""
+    """Return (H, W, C) blurred in both directions by three taps of that standard deviation in cells.
+
+    Edges are extended.
+    """
     side = np.float32(deviation**2 / 2)
     for axis in (0, 1):
         lines = np.moveaxis(raster, axis, 0)
@@ -126,10 +131,11 @@ def softened(raster: Raster, deviation: float) -> Raster:
 
 
 def jpeg_error(photo: Raster, quality: int, pixels: float) -> Raster:
-    """(H, W, 3) what JPEG (libjpeg's, chroma halved) adds to the cells' means of a photo encoded in 0..1.
+    """Return (H, W, 3), the error that JPEG (libjpeg's, chroma halved) adds to the cells' means of a photo in
+    0..1.
 
-    The photo is drawn at `pixels` a cell, so that a block of 8 pixels spans 8 / pixels cells, and chroma's
-    twice that. Drawing and averaging blur by themselves, so only the error is averaged.
+    The photo is drawn at `pixels` per cell, so that a block of 8 pixels spans 8 / pixels cells, and chroma's
+    block twice that. Drawing and averaging blur by themselves, so only the error is averaged.
     """
     height, width = photo.shape[:2]
     size = round(width * pixels), round(height * pixels)
@@ -142,5 +148,5 @@ def jpeg_error(photo: Raster, quality: int, pixels: float) -> Raster:
 
 
 def eight_bits(encoded: Raster) -> NDArray[np.uint8]:
-    """Values encoded in 0..1, rounded to codes; beyond, clipped."""
+    """Return values encoded in 0..1, rounded to codes. Values outside are clipped."""
     return np.rint(encoded * 255).clip(0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Other maps of a scene's light in the Lumi map's place, by the same renderer: what it is worth as control.
+"""Maps of a scene's light that replace the Lumi map, by the same renderer, to measure its value as control.
 
 All are linear, by source, and additive in sources, like the Lumi map L, of which each gives up one thing:
 
@@ -49,12 +49,12 @@ LUMI: Final = "lumi"
 KINDS: Final = (LUMI, "irradiance", "shading", "phong")
 SPECULAR: Final = 0.2  # s above
 EXPONENT: Final = 32.0  # n above
-DARKEST: Final = 1e-3  # reflectance that is divided by; no texture is as dark, only what lies behind a scene
+DARKEST: Final = 1e-3  # reflectance used as divisor; no texture is as dark, only pixels behind a scene
 
 
 @dataclass(frozen=True)
 class Stages:
-    """A scene's things: as they are and white, all without gloss, and white with a highlight."""
+    """A scene's objects: as they are and white, all without gloss, and white with a highlight."""
 
     original_stage: Stage
     matte: Stage
@@ -77,7 +77,7 @@ class Stages:
 
 
 def glossy_white(specular: float, exponent: float) -> dict[str, Any]:
-    """White with a highlight, for the renderer: `specular` of what it sends back lies in the lobe."""
+    """Return white with a highlight, for the renderer. `specular` of the reflected light lies in the lobe."""
     matte = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
     lobe = {
         "type": "roughconductor",
@@ -90,7 +90,7 @@ def glossy_white(specular: float, exponent: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Shot:
-    """One source from one camera. resolution: pixels a side. samples: rays a pixel."""
+    """One source from one camera. resolution: pixels per side. samples: rays per pixel."""
 
     camera: Camera
     source: Source
@@ -102,38 +102,41 @@ class Shot:
         return render(stage, self.camera, self.source, self.resolution, self.samples, self.seed)
 
     def lumi(self, stages: Stages) -> Raster:
-        """(H, W, 3) the Lumi map."""
+        """Return the Lumi map, (H, W, 3)."""
         return self._of(lumi_map, stages.original_stage)
 
     def phong(self, stages: Stages) -> Raster:
-        """(H, W, 3) the Phong map."""
+        """Return the Phong map, (H, W, 3)."""
         return self._of(lumi_map, stages.glossy)
 
     def irradiance(self, stages: Stages, albedo: Raster) -> Raster:
-        """(H, W, 3) E / pi. albedo: what `albedo` gives."""
+        """Return (H, W, 3) E / pi. albedo: the result of `albedo`."""
         return over(self._of(picture, stages.matte), albedo)
 
     def shading(self, stages: Stages, albedo: Raster) -> Raster:
-        """(H, W, 3) the picture over the reflectance. albedo: what `albedo` gives."""
+        """Return (H, W, 3) the picture over the reflectance. albedo: the result of `albedo`."""
         return over(self._of(picture, stages.original_stage), albedo)
 
     def albedo(self, stages: Stages) -> Raster:
-        """(H, W, 3) the reflectance that the camera sees, whatever the source; 0 where it sees nothing."""
+        """Return (H, W, 3), the reflectance that the camera sees, whatever the source; 0 where it sees
+        nothing.
+        """
         wanted = {"type": "aov", "aovs": "albedo:albedo"}
         shapes, size = stages.matte.original, self.resolution
         return render(shapes, self.camera, self.source, wanted, size, self.samples, self.seed)[..., :3]
 
 
 def over(image: Raster, albedo: Raster) -> Raster:
-    """(H, W, 3) float32: the image divided by the reflectance."""
+    """Return (H, W, 3) float32: the image divided by the reflectance."""
     return (image / np.maximum(albedo, np.float32(DARKEST))).astype(np.float32)
 
 
 def with_maps(view: View, camera: int = 0, samples: int = SAMPLES) -> dict[str, View]:
-    """A view of `render_scenes` under every kind of map, by kind: the same pictures, in the same units.
+    """Return a view of `render_scenes` under every kind of map, by kind: the same pictures, in the same
+    units.
 
-    camera: which of the scene's it was taken by. samples: rays a pixel it was rendered with. Raises
-    InputError where its Lumi map does not come out again, as scene, camera or renderer are others then.
+    camera: the scene's camera that took it. samples: the rays per pixel it was rendered with. Raises
+    InputError where its Lumi map cannot be reproduced, because scene, camera or renderer have changed.
     """
     described = scene(view.seed, VIEWS)
     stages = Stages.load(described.things)
@@ -147,7 +150,7 @@ def with_maps(view: View, camera: int = 0, samples: int = SAMPLES) -> dict[str, 
         unit = unit_of(light)
         if not np.array_equal(half_floats(light * unit), view.lumi[k]):
             raise InputError(f"The render of scene {view.seed} was made by other code; render it anew.")
-        # The noise of the maps must tell nothing of that in the pictures.
+        # The noise of the maps must contain no information about the noise of the pictures.
         shot = replace(shot, seed=len(described.sources) + k)
         albedo = shot.albedo(stages) if albedo is None else albedo
         others = (
@@ -155,7 +158,7 @@ def with_maps(view: View, camera: int = 0, samples: int = SAMPLES) -> dict[str, 
             shot.shading(stages, albedo),
             shot.phong(stages),
         )
-        # A source whose straight light misses what the camera sees is in no pair, whatever the map.
+        # A source whose direct light misses everything that the camera sees is in no pair, whatever the map.
         seen = unit if usable[k] else 0.0
         for kind, raster in zip(KINDS, (light, *others), strict=True):
             maps[kind].append(half_floats(raster * (unit if kind == LUMI else seen)))
@@ -170,13 +173,13 @@ def render_maps(
     samples: int = SAMPLES,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """The views of a folder of renders to `out/<kind>/`, each with that map in the Lumi map's place.
+    """Render the views of a folder of renders to `out/<kind>/`, each with that map in place of the Lumi map.
 
-    Of each scene the first camera's view; of these `views` from `first` on. samples: rays a pixel that the
-    renders were made with. What is there already is kept.
-    Raises InputError where there are too few, for what `with_maps` refuses, and where nothing can be written.
+    Takes each scene's view from the first camera, and `views` of these from `first` on. samples: the rays per
+    pixel that the renders were made with. Existing files are kept. Raises InputError where there are too few,
+    for the reasons that `with_maps` refuses, and where nothing can be written.
     """
-    mitsuba()  # where it is missing, no folder is made
+    mitsuba()  # no folder is made where it is missing
     paths = sorted(renders.glob("[0-9]*-0.npz"))[first : first + views]
     if len(paths) < views:
         raise InputError(f"There are {len(paths)} scenes in {renders} from {first} on, fewer than {views}.")

@@ -1,4 +1,4 @@
-"""Photos of rendered scenes, one view under several lights: what stands in for real pairs in stage 2.
+"""Photos of rendered scenes, one view under several lights. They replace real pairs in stage 2.
 
 {out}/{view}/{k}.png     8-bit sRGB, by one random camera a view
 """
@@ -31,9 +31,9 @@ def take_photos(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Photos of scenes, of their second cameras' views, to `out/<view>/<k>.png`; returns `out`.
+    """Take photos of scenes from their second cameras, to `out/<view>/<k>.png`, and return `out`.
 
-    without: a folder of views whose scenes are left out. scenes: how many to take; None for all. Raises
+    without: a folder of views whose scenes are left out. scenes: the number of scenes, None for all. Raises
     InputError where there are too few others.
     """
     taken = {path.stem.partition("-")[0] for path in without.glob("*-*.npz")} if without else set()
@@ -56,7 +56,9 @@ def take_photos(
 
 
 def photos_of(view: View, rng: Generator, count: int = PHOTOS) -> Iterator[NDArray[np.uint8]]:
-    """A view under random lights, as one camera of random style takes it each time: (H, W, 3) 8-bit sRGB."""
+    """Yield a view under random lights, each time taken by one camera of random style: (H, W, 3) 8-bit
+    sRGB.
+    """
     camera, balance = random_camera(rng), white_balance(rng)
     usable = usable_sources(view)
     for _ in range(count):

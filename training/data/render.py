@@ -1,4 +1,4 @@
-"""Renders: every source of a scene alone, as a picture with the scene's materials and as a Lumi map.
+"""Renders: each source of a scene alone, as a picture with the scene's materials and as a Lumi map.
 
 A Lumi map is the light that a white matte surface of albedo 1 in each surface's place sends back, straight
 from the source and nothing bounced:
@@ -31,19 +31,20 @@ from dior_rt.training.scenes.world import world
 RESOLUTION = 96
 SAMPLES = 8
 BOUNCES = 4
-VIEWS = 2  # a scene
+VIEWS = 2  # per scene
 FORMAT = 1
 AROUND = ("dome", "sky")  # kinds of source that shine from everywhere
 GUIDE_SAMPLES = 4
-LIT = 0.12  # of a view's pixels, the least share that a source must reach
+LIT = 0.12  # the least share of a view's pixels that a source must reach
 
 
 @dataclass(frozen=True)
 class Domain:
-    """Where scenes come from, and how they are rendered.
+    """A domain of scenes, and how they are rendered.
 
-    scene: of a number and a count of cameras. prefix: of its files' names, as domains may share a folder.
-    skips_dim_sources: leave out sources that hardly light a view. denoised: whether renders are.
+    scene: makes a scene from a number and a count of cameras. prefix: of its files' names, because domains
+    may share a folder. skips_dim_sources: whether to leave out sources that hardly light a view. denoised:
+    whether renders are denoised.
     """
 
     scene: Callable[[int, int], Scene]
@@ -59,10 +60,10 @@ DOMAINS = {
 
 
 def mitsuba() -> Any:
-    """The renderer, in the variant that needs nothing but its wheel.
+    """Return the renderer, in the variant that needs nothing but its wheel.
 
-    Shards, one process a core, use all cores; the LLVM variant compiles anew for most scenes, which costs at
-    these sizes what it gains.
+    Shards, with one process per core, use all cores. The LLVM variant compiles anew for most scenes, which at
+    these sizes costs as much time as it saves.
     """
     import mitsuba as mi
 
@@ -74,10 +75,10 @@ def mitsuba() -> Any:
 
 @dataclass(frozen=True)
 class View:
-    """One scene from one camera, by source, each alone.
+    """One scene from one camera, with each source alone.
 
-    images, lumi: (sources, H, W, 3), linear; every source so strong that the mean of its Lumi map is 1/4.
-    kinds: of the sources; what shines from everywhere comes last.
+    images, lumi: (sources, H, W, 3), linear; the strength of every source makes the mean of its Lumi map 1/4.
+    kinds: those of the sources; sources that shine from everywhere come last.
     """
 
     images: NDArray[np.float16]
@@ -87,14 +88,14 @@ class View:
     seed: int
 
     def save(self, path: Path) -> None:
-        """Written whole or not at all. Raises InputError."""
+        """Write the view whole or not at all. Raises InputError."""
         head = {"format": FORMAT, "kinds": self.kinds, "scene_kind": self.scene_kind, "seed": self.seed}
         with replacing(path) as file:
             np.savez(file, images=self.images, lumi=self.lumi, head=np.array(json.dumps(head)))
 
     @staticmethod
     def load(path: Path) -> View:
-        """What `save` wrote. Raises InputError for a file that is cut short, or something else."""
+        """Read what `save` wrote. Raises InputError for a file that is cut short, or of another kind."""
         try:
             with np.load(path, allow_pickle=False) as stored:
                 head = json.loads(str(stored["head"]))
@@ -114,16 +115,16 @@ def render_scenes(
     progress: Callable[[int, int], None] | None = None,
     domain: str = "plain",
 ) -> None:
-    """Render the scenes that are not there yet, two views each, to `out/<scene>-<view>.npz`.
+    """Render the missing scenes, two views each, to `out/<scene>-<view>.npz`.
 
-    domain: a name in DOMAINS. shard: (index, count), this process's share. Scene numbers are
-    seed * 1,000,000 + k for k in 0 .. scenes - 1, so that sets of different seeds share none. Raises
-    InputError where nothing can be written, or for a domain that is none.
+    domain: a name in DOMAINS. shard: (index, count), this process's share. Scene numbers are seed * 1,000,000
+    + k for k in 0 .. scenes - 1, so that sets of different seeds share none. Raises InputError where nothing
+    can be written, or for an unknown domain.
     """
     if domain not in DOMAINS:
         raise InputError(f"There is no domain {domain}; there are {', '.join(DOMAINS)}.")
     chosen = DOMAINS[domain]
-    mitsuba()  # where it is missing, no folder is made
+    mitsuba()  # no folder is made where it is missing
     if chosen.denoised:
         import mitsuba_oidn  # noqa: F401
     make_folder(out)
@@ -143,26 +144,29 @@ def render_scenes(
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Things in one set of materials, and the renderer's scenes of them under one source each.
+    """Objects in one set of materials, and the renderer's scenes of them under one source each.
 
-    To build one costs as much as to render it, so all cameras share it.
+    Building one costs as much as rendering it, so all cameras share it.
     """
 
     things: dict[str, Any]
     scenes: dict[int, tuple[Source | None, Any]] = field(default_factory=dict)
 
     def under(self, source: Source | None) -> Any:
-        """The renderer's scene under that source, or in the dark."""
+        """Return the renderer's scene under that source, or in the dark."""
         if id(source) not in self.scenes:
             lights = {"source": emitter_of(source)} if source else {}
             loaded = mitsuba().load_dict({"type": "scene", **lights, **self.things})
-            self.scenes[id(source)] = source, loaded  # with the source, so that its id stays its own
+            self.scenes[id(source)] = source, loaded  # with the source, so that it keeps its id
         return self.scenes[id(source)][1]
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene's things as they are, and all white and matte; loaded once, as it costs as much as a render."""
+    """A scene's objects as they are, and all white and matte.
+
+    Loaded once, as loading costs as much as a render.
+    """
 
     original: Shapes
     white: Shapes
@@ -198,9 +202,12 @@ def view(
 
 
 def lit(stage: Stage, described: Scene, camera: Camera) -> Scene:
-    """The scene with the first SOURCES local sources that light enough of a view, and its environment if it
-    does; where none does, the one that lights most. What lights next to nothing would, brought to the common
-    mean, be noise."""
+    """Return the scene with the sources that light enough of a view.
+
+    It keeps the first SOURCES local sources of this kind, and the environment if it qualifies. Where no
+    source does, it keeps the one that lights most. A source that lights almost nothing would be noise after
+    scaling to the common mean.
+    """
     *local, environment = described.sources
     found = islice((source for source in local if reach(stage, camera, source) >= LIT), SOURCES)
     around = [environment] if reach(stage, camera, environment) >= LIT else []
@@ -209,38 +216,43 @@ def lit(stage: Stage, described: Scene, camera: Camera) -> Scene:
 
 
 def reach(stage: Stage, camera: Camera, source: Source) -> float:
-    """The share of a view's pixels that get more than a tenth of its mean light, by a quick probe."""
+    """Return the share of a view's pixels that get more than a tenth of its mean light, by a quick probe."""
     probe = np.nan_to_num(lumi_map(stage, camera, source, resolution=32, samples=4)).mean(axis=2)
     return float((probe > 0.1 * probe.mean()).mean())
 
 
 def surfaces(stage: Stage, camera: Camera, resolution: int) -> Guides:
-    """What the camera sees of the things' own surfaces, for the denoiser."""
+    """Return the surfaces that the camera sees, for the denoiser."""
     integrator = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
     layers = render(stage.original, camera, None, integrator, resolution, GUIDE_SAMPLES, seed=0)
     return Guides(*(np.ascontiguousarray(np.nan_to_num(part)) for part in np.split(layers, 2, axis=2)))
 
 
 def rays_for(source: Source, samples: int) -> int:
-    """How many a pixel a source takes: of what shines from everywhere most rays are blocked."""
+    """Return the rays per pixel for a source.
+
+    Most rays of a source that shines from everywhere are blocked.
+    """
     return 2 * samples if source.kind in AROUND else samples
 
 
 def unit_of(light: NDArray[np.float32]) -> float:
-    """What brings a Lumi map to the common mean, which suits half floats: a source's strength is arbitrary
-    until triplets mix it."""
+    """Return the factor that brings a Lumi map to the common mean, which suits half floats.
+
+    A source's strength is arbitrary until triplets mix it.
+    """
     return 0.25 / max(float(light.mean()), 1e-6)
 
 
 def half_floats(raster: NDArray[np.float32]) -> NDArray[np.float16]:
-    """Half floats, within their range; NaN becomes 0."""
+    """Return half floats, within their range. NaN becomes 0."""
     return np.clip(np.nan_to_num(raster), 0, 6e4).astype(np.float16)
 
 
 def picture(
     stage: Stage, camera: Camera, source: Source, resolution: int, samples: int, seed: int = 0
 ) -> NDArray[np.float32]:
-    """(H, W, 3) linear radiance with the scene's own materials and bounced light."""
+    """Return (H, W, 3) linear radiance with the scene's materials and bounced light."""
     integrator = {"type": "path", "max_depth": BOUNCES, "hide_emitters": True}
     return render(stage.original, camera, source, integrator, resolution, samples, seed)[..., :3]
 
@@ -248,7 +260,7 @@ def picture(
 def lumi_map(
     stage: Stage, camera: Camera, source: Source, resolution: int, samples: int, seed: int = 0
 ) -> NDArray[np.float32]:
-    """(H, W, 3) the Lumi map of one source of radiance 1: white matte surfaces, direct light only."""
+    """Return (H, W, 3), the Lumi map of one source of radiance 1: white matte surfaces, direct light only."""
     integrator = {"type": "direct", "hide_emitters": True}
     return render(stage.white, camera, source, integrator, resolution, samples, seed)[..., :3]
 
@@ -262,7 +274,7 @@ def render(
     samples: int,
     seed: int,
 ) -> NDArray[np.float32]:
-    """(H, W, channels of the integrator) of the shapes under a source, or in the dark."""
+    """Return (H, W, channels of the integrator) of the shapes under a source, or in the dark."""
     mi = mitsuba()
     sensor, integrate = mi.load_dict(_sensor(camera, resolution)), mi.load_dict(integrator)
     rendered = mi.render(shapes.under(source), sensor=sensor, integrator=integrate, spp=samples, seed=seed)
@@ -270,7 +282,7 @@ def render(
 
 
 def load_shapes(things: tuple[Thing, ...], bsdf: Callable[[Material], dict[str, Any]]) -> Shapes:
-    """The renderer's meshes of some things, each with the material that `bsdf` makes of its own."""
+    """Return the renderer's meshes of some objects, each with the material that `bsdf` makes of its own."""
     mi = mitsuba()
     return Shapes(
         {f"thing{k}": _mesh(thing.mesh, mi.load_dict(bsdf(thing.material))) for k, thing in enumerate(things)}
@@ -310,7 +322,7 @@ def _bumped(material: Material, surface: dict[str, Any]) -> dict[str, Any]:
 
 
 def bsdf_of(material: Material) -> dict[str, Any]:
-    """A material as the renderer describes it."""
+    """Return a material in the renderer's description."""
     mi = mitsuba()
     bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(material.reflectance), "raw": True}
     surface: dict[str, Any]
@@ -343,7 +355,7 @@ def _sensor(camera: Camera, resolution: int) -> dict[str, Any]:
 
 
 def emitter_of(source: Source) -> dict[str, Any]:
-    """A source as the renderer describes it."""
+    """Return a source in the renderer's description."""
     mi = mitsuba()
     radiance = {"type": "rgb", "value": 1.0}
     area = {"type": "area", "radiance": radiance}

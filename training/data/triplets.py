@@ -1,9 +1,9 @@
 """Triplets (photo, strokes, relit photo) mixed on the fly from renders of single sources, in linear light.
 
 A photo is the sum of its sources' renders, each with a strength and a tint, under one exposure that source
-and target share; its Lumi map is the same sum of their Lumi maps. Four kinds of pair: one light is added,
-removed or changed, and the strokes speak of where it matters; the same in one part of the picture only; all
-lights are replaced; nothing changes. A camera makes pictures of the light.
+and target share. Its Lumi map is the same sum of their Lumi maps. There are four kinds of pair: one light is
+added, removed or changed, and the strokes mark the important places; the same in only one part of the
+picture; all lights are replaced; nothing changes. A camera makes pictures of the light.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ GRIDS: Grids = ((64, 64), (56, 80), (80, 56))
 CHANGES = ("change", "local", "dab")  # of one light, of one place, and of the place of a lone dab
 KINDS = (*CHANGES, "replace", "keep")
 KIND_SHARES = (0.26, 0.20, 0.20, 0.25, 0.09)
-# Of all lights alike, by any factor, in a part of the picture of these radii, of the shorter side: what a
-# lone dab says holds about it.
+# All lights of a part of the picture change by any factor. The part has these radii, as a share of the
+# shorter side. A lone dab describes the light of the part about it.
 PARTS = {"local": (0.15, 0.6), "dab": (0.1, 0.35)}
-FALL = (2.5, 8.0)  # the power of the distance by which they end
-STOPS = 4.0  # by which these change, at most
+FALL = (2.5, 8.0)  # the power of the distance at which they end
+STOPS = 4.0  # the largest of these changes, in stops
 BURNT = 0.25  # the share of pairs whose relit picture may be far too bright for the display
-DAB = (0.04, 0.15)  # the radius of a lone dab, of the shorter side
+DAB = (0.04, 0.15)  # the radius of a lone dab, as a share of the shorter side
 DIMMEST = 0.02  # mean of a usable source's Lumi map; fainter ones miss what the camera sees
 
 
@@ -62,7 +62,7 @@ class Pair:
 
 
 def mix(view: View, lights: Lights) -> tuple[Raster, Raster]:
-    """The image and the Lumi map of a view under some lights."""
+    """Return the image and the Lumi map of a view under some lights."""
     image = np.zeros(view.images.shape[1:], np.float32)
     lumi = np.zeros_like(image)
     for k in np.flatnonzero(lights.any(axis=1)):
@@ -72,7 +72,7 @@ def mix(view: View, lights: Lights) -> tuple[Raster, Raster]:
 
 
 def tint(rng: Generator) -> Raster:
-    """A light's colour, of luminance about 1: white, warm or cool half of the time, else any hue."""
+    """Return a light's colour, of luminance about 1: white, warm or cool half of the time, else any hue."""
     if rng.uniform() < 0.5:
         warmth = rng.normal(0, 0.25)
         return np.exp([warmth, 0.0, -1.4 * warmth]).astype(np.float32)
@@ -82,12 +82,12 @@ def tint(rng: Generator) -> Raster:
 
 
 def usable_sources(view: View) -> NDArray[np.bool_]:
-    """(sources,) which of them light enough of what the camera sees."""
+    """Return (sources,), which of them light enough of what the camera sees."""
     return np.asarray(view.lumi.mean(axis=(1, 2, 3), dtype=np.float32) > DIMMEST)
 
 
 def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
-    """One or more of the usable sources, at strengths over some three stops, tinted."""
+    """Return one or more of the usable sources, at strengths over about three stops, tinted."""
     on = usable & (rng.uniform(size=usable.size) < 0.55)
     if not on.any():
         on = np.zeros_like(usable)
@@ -97,7 +97,10 @@ def random_lights(rng: Generator, usable: NDArray[np.bool_]) -> Lights:
 
 
 def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lights:
-    """One light added, removed, dimmed, strengthened or tinted anew; never the last one removed."""
+    """Return the lights with one added, removed, dimmed, strengthened or tinted anew.
+
+    The last one is never removed.
+    """
     changed = lights.copy()
     k = rng.choice(np.flatnonzero(usable))
     if not lights[k].any():
@@ -115,23 +118,24 @@ def change_one(rng: Generator, lights: Lights, usable: NDArray[np.bool_]) -> Lig
 
 
 def gel(rng: Generator) -> Raster:
-    """(3,) what all lights of a place are strengthened or dimmed by, and tinted.
+    """Return (3,), the factor and tint of all lights of a place.
 
-    Were it mostly next to 1, what is drawn would tell what light is there, and half the light drawn would
-    not be taken at its word.
+    If the factor were mostly next to 1, the strokes would reveal the light that is there, and half the drawn
+    light would not be taken at its value.
     """
     return np.float32(2 ** rng.uniform(-STOPS, STOPS)) * tint(rng)
 
 
 def exposed(image: Raster, white: float) -> float:
-    """The exposure that brings an image's 95th percentile to `white`."""
+    """Return the exposure that brings an image's 95th percentile to `white`."""
     return white / max(float(np.percentile(image.max(axis=2), 95)), 1e-4)
 
 
 def flag(rng: Generator, shape: tuple[int, int], radii: tuple[float, float]) -> Raster:
-    """(h, w) in 0..1: what of a light passes where flags keep it off all but one soft-edged part.
+    """Return (h, w) in 0..1, the share of a light that passes where flags block it except in one soft-edged
+    part.
 
-    radii: the least and the most of the part's, of the shorter side.
+    radii: the smallest and the largest radius of the part, as a share of the shorter side.
     """
     rows, columns = np.indices(shape) + 0.5
     x = (columns - rng.uniform(0, shape[1])) / min(shape)
@@ -150,7 +154,7 @@ def pair(
     burnt: bool = False,
     balance: Raster | float = 1.0,
 ) -> Pair:
-    """A random pair of one view, of the given kind or of any.
+    """Return a random pair of one view, of that kind or of any.
 
     burnt: the relit picture may be far too bright for the display. balance: (3,) tints all lights alike.
     """
@@ -168,9 +172,9 @@ def pair(
         passing = flag(rng, photo.shape[:2], PARTS[kind])[..., None]
         relit, target = photo + passing * (relit - photo), source + passing * (target - source)
     exposure, strength = exposed(photo, rng.uniform(0.3, 1.1)), 1.0
-    # A picture lost in white teaches little. One changed light must stay itself beside the others, so the
-    # exposure gives way to it; lights that replace all others may be as strong as suits. But a person may
-    # draw light that burns a place out, and has to see it burn.
+    # A picture that is mostly white teaches little. One changed light must keep its strength relative to the
+    # others, so the exposure is reduced for it. Lights that replace all others may have any suitable
+    # strength. But a user may draw light that burns a place out, and must then see it burn.
     if kind in ("change", "local") and not burnt:
         exposure = min(exposure, exposed(relit, rng.uniform(0.9, 1.5)))
     elif kind == "replace":
@@ -185,7 +189,7 @@ def pair(
 
 
 def window(rng: Generator, size: int, grid: tuple[int, int]) -> tuple[slice, slice, bool]:
-    """A random part of a square picture in the grid's shape, and whether to mirror it."""
+    """Return a random part of a square picture in the grid's shape, and whether to mirror it."""
     scale = rng.uniform(0.7, 1.0) * size / max(grid)
     height, width = round(grid[0] * scale), round(grid[1] * scale)
     top, left = rng.integers(0, size - height + 1), rng.integers(0, size - width + 1)
@@ -197,7 +201,7 @@ def part(view: View, rows: slice, columns: slice) -> View:
 
 
 def zoomed(sample: Pair, grid: tuple[int, int], mirror: bool = False) -> Pair:
-    """The pair resampled to the grid, in linear light."""
+    """Return the pair resampled to the grid, in linear light."""
     rasters = np.stack([sample.photo, sample.relit, sample.source, sample.target])
     planes = torch.from_numpy(rasters).permute(0, 3, 1, 2)
     small = F.interpolate(planes, size=grid, mode="bilinear", antialias=True).clamp_min(0)
@@ -207,13 +211,13 @@ def zoomed(sample: Pair, grid: tuple[int, int], mirror: bool = False) -> Pair:
 
 
 def interest(sample: Pair) -> Raster:
-    """(h, w) where a person would draw: where the light changes most."""
+    """Return (h, w), where a user would draw: where the light changes most."""
     change = np.abs(log_ratio(sample.target, sample.source)).max(axis=2)
     return (change**2 + 1e-6).astype(np.float32)
 
 
 def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
-    """Light (h, w, 3) and mask (h, w) that a person might have drawn for the pair, at grid size."""
+    """Return light (h, w, 3) and mask (h, w) that a user might have drawn for the pair, at grid size."""
     if sample.kind == "dab":
         mask = dab(rng, interest(sample))
         return flat(sample.target, mask), mask
@@ -221,7 +225,7 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
     modes: tuple[Sparsity, ...] = ("strokes", "coarse", "dense")
     mode = "strokes" if at_change else modes[rng.choice(3, p=[0.5, 0.25, 0.25])]
     where = interest(sample) if at_change else None
-    # Who changes a light or all of them draws more than once; a lone stroke means its own place.
+    # Users draw at least two strokes when one or all lights change. A lone stroke marks its own place.
     times = 2 if mode == "strokes" and sample.kind in ("change", "replace") else 1
     drawn = [ops.sparsify(sample.target, mode, int(rng.integers(2**31)), where) for _ in range(times)]
     light = np.max([strokes.light for strokes in drawn], axis=0)
@@ -230,7 +234,7 @@ def draw(rng: Generator, ops: NumpyOps, sample: Pair) -> tuple[Raster, Raster]:
 
 
 def dab(rng: Generator, interest: Raster) -> Raster:
-    """The mask (h, w) of one round touch of the brush, where interest says."""
+    """Return the mask (h, w) of one round touch of the brush, placed by interest."""
     height, width = interest.shape
     share = interest.ravel().astype(np.float64)
     centre = int(rng.choice(share.size, p=share / share.sum()))
@@ -241,7 +245,9 @@ def dab(rng: Generator, interest: Raster) -> Raster:
 
 
 def flat(lumi: Raster, mask: Raster) -> Raster:
-    """The map under a mask, each stroke of the mean colour there: a brush lays one, a map's values vary."""
+    """Return the map under a mask with the mean colour of each stroke, because a brush has one colour and a
+    map varies.
+    """
     strokes, count = label(mask > 0)
     light = np.zeros_like(lumi)
     for k in range(1, count + 1):
@@ -251,8 +257,11 @@ def flat(lumi: Raster, mask: Raster) -> Raster:
 
 @dataclass(frozen=True)
 class Mix:
-    """The share of samples that estimate, beside looking for the photo's own light as all do; of the others,
-    the share without strokes, for guidance."""
+    """The shares of the sample kinds.
+
+    The share of samples that estimate, besides estimating the photo's own light as all do; and of the others,
+    the share without strokes, for guidance.
+    """
 
     estimate: float = 0.04
     null: float = 0.06
@@ -261,8 +270,8 @@ class Mix:
 class Batches(IterableDataset[dict[str, Tensor]]):
     """An endless stream of batches: the network's inputs, `x0` and `own`. The n-th is the same on every run.
 
-    start: the number of the first batch. rank: of this process, where several train together. grids: a
-    batch's light grid is one of these.
+    start: the number of the first batch. rank: the number of this process, where several train together.
+    grids: a batch's light grid is one of these.
     """
 
     def __init__(
@@ -287,7 +296,8 @@ class Batches(IterableDataset[dict[str, Tensor]]):
 
     def make(self, rng: Generator) -> dict[str, Tensor]:
         grid = self.grids[rng.integers(len(self.grids))]
-        # Each sample draws for itself: what one view needs more or less does not change the others.
+        # Each sample has its own random generator, so a view that draws more or fewer numbers does not
+        # change the others.
         samples = [self._sample(stream, grid) for stream in rng.spawn(self.batch)]
         return {name: torch.stack([sample[name] for sample in samples]) for name in samples[0]}
 
@@ -305,10 +315,10 @@ class Batches(IterableDataset[dict[str, Tensor]]):
 
 @dataclass(frozen=True)
 class Shots:
-    """What a camera makes of a pair: the photo in 8 bits, and how much the new light changes the picture.
+    """A camera's pictures of a pair: the photo in 8 bits, and the change that the new light makes.
 
-    photo: (H, W, 3) float32, sRGB-encoded. change: of the encoded values. The camera's flaws are the
-    photo's own and stay in the relit picture, so the change has none.
+    photo: (H, W, 3) float32, sRGB-encoded. change: that of the encoded values. The camera's flaws belong to
+    the photo and stay in the relit picture, so the change contains none.
     """
 
     photo: Raster
@@ -323,7 +333,7 @@ class Shots:
 def example(
     sample: Pair, shots: Shots, strokes: tuple[Raster, Raster] | None, mode: Mode
 ) -> dict[str, Tensor]:
-    """The network's inputs for a pair, and what it should find: x0, and `own`, the light on the photo."""
+    """Return the network's inputs for a pair, and the targets: x0, and `own`, the light on the photo."""
 
     def planes(raster: Raster) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(raster)).permute(2, 0, 1).contiguous()
@@ -341,7 +351,7 @@ def example(
 
 
 def load_views(folder: Path) -> list[View]:
-    """All views of a folder of renders, half a megabyte each. Raises InputError if there is none."""
+    """Return all views of a folder of renders, half a megabyte each. Raises InputError if there is none."""
     paths = sorted(folder.glob("*-*.npz"))
     if not paths:
         raise InputError(

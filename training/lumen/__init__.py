@@ -1,1 +1,1 @@
-"""Lumen: the network that reads a photo's scene first and then completes the light that is drawn on it."""
+"""Lumen: the network that first reads the scene from a photo and then completes the drawn light."""

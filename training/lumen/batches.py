@@ -1,8 +1,8 @@
-"""Training samples made on the device: mixed lights, a camera, crops and strokes, all as batched torch
+"""Make training samples on the device: mixed lights, a camera, crops and strokes, all as batched torch
 operations.
 
-A photo is the sum of its sources' pictures, each with a strength and a colour; its Lumi map is the same sum
-of their Lumi maps. The photo's own lights are near white, as most real light is; drawn light may have any
+A photo is the sum of its sources' pictures, each with a strength and a colour. Its Lumi map is the same sum
+of their Lumi maps. The photo's own lights are near white, as most real light is. Drawn light may have any
 colour.
 """
 
@@ -24,18 +24,18 @@ from dior_rt.training.lumen.optics import encode_light, linear_to_srgb, luminanc
 from dior_rt.training.lumen.strokes import ADD, LEAST_FACTOR, MULTIPLY, SET, peak
 from dior_rt.training.lumen.views import Views, from_code
 
-#: What changes between photo and relit picture, and how often.
+#: The kinds of change between photo and relit picture, and their frequencies.
 LAMP, CHANGE, REPLACE, LOCAL, KEEP = range(5)
 SHARES: Final = (0.27, 0.18, 0.20, 0.27, 0.08)
 SATURATED: Final = 0.08  # share of photos with a light of any hue
-DENSE, COARSE = 0.08, 0.08  # shares of `set` samples whose whole map, or coarse parts of it, is given
+DENSE, COARSE = 0.08, 0.08  # shares of `set` samples that get the whole map, or coarse parts of it
 SKY_ID: Final = 255
-BRIGHTEST: Final = 100.0  # light that a sample may have; encoded, 3.04
+BRIGHTEST: Final = 100.0  # the largest light of a sample; encoded, 3.04
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What the network should find, (B, ., H, W) each."""
+    """The targets of the network, (B, ., H, W) each."""
 
     light: Tensor  # 3, source Lumi map
     target: Tensor  # 3, target Lumi map
@@ -84,7 +84,7 @@ class Lit:
     target: Tensor
 
     def changed(self, where: Tensor, relit: Tensor, target: Tensor) -> Lit:
-        """The same photo, with another relit picture and target where `where` (B, 1, 1, 1)."""
+        """Return the same photo, with another relit picture and target where `where` (B, 1, 1, 1) is set."""
         return replace(
             self, relit=torch.where(where, relit, self.relit), target=torch.where(where, target, self.target)
         )
@@ -103,7 +103,7 @@ class BatchMaker:
         self.views, self.count, self.seed, self.side = views, count, seed, side or views.size
         self.tiles = views.albedo.new_zeros(0, 3, 1, 1) if tiles is None else tiles
         self.device = views.images.device
-        self.cell_slope = float(views.slope.mean()) * 2 / self.side  # a cell's side at distance 1, about
+        self.cell_slope = float(views.slope.mean()) * 2 / self.side  # side of a cell at distance 1, roughly
         self.generator = Generator(device=self.device)
 
     def make(self, number: int) -> Batch:
@@ -153,7 +153,7 @@ class BatchMaker:
     # ------------------------------------------------------------------------------------------------------
 
     def _scenery(self) -> Scenery:
-        """A random crop of a random view for each sample, mirrored half of the time."""
+        """Return a random crop of a random view for each sample, mirrored half of the time."""
         views, count = self.views, self.count
         which = torch.randint(len(views), (count,), generator=self.generator, device=self.device)
         scale = self._uniform(count, low=0.55)
@@ -176,7 +176,7 @@ class BatchMaker:
         lumi = cut(from_code(views.lumi[which], most).flatten(1, 2)).unflatten(1, (k, 3))
         ids = cut(views.ids[which].float(), "nearest")
         sky = (ids == SKY_ID).float()
-        # The environment is seen directly in the sky: there its light is taken to be its mean on the ground.
+        # The environment is seen directly in the sky. Its light there is taken to be its mean on the ground.
         ground = (1 - sky)[:, None]
         mean = (lumi * ground).sum(dim=(3, 4), keepdim=True) / ground.sum(dim=(3, 4), keepdim=True).clamp_min(
             1
@@ -214,20 +214,22 @@ class BatchMaker:
     # -----------------------------------------------------------------------------------------------------
 
     def _neutral(self, *shape: int) -> Tensor:
-        """Colours on the line from warm to cool, a few of any hue, of luminance 1: (*shape, 3)."""
+        """Return colours on the line from warm to cool, a few of any hue, of luminance 1: (*shape, 3)."""
         warmth = 0.16 * self._normal(*shape)
         colour = torch.exp(torch.stack([warmth, torch.zeros_like(warmth), -1.4 * warmth], dim=-1))
         return torch.where(self._uniform(*shape, 1) < SATURATED, self._any(*shape), _unit(colour))
 
     def _any(self, *shape: int) -> Tensor:
-        """Colours of any hue, white one time in three, of luminance 1: (*shape, 3)."""
+        """Return colours of any hue, white one time in three, of luminance 1: (*shape, 3)."""
         hue = self._uniform(*shape, 1) * 6
         rainbow = ((hue + torch.tensor([0.0, 4.0, 2.0], device=self.device)) % 6 - 3).abs().sub(1).clamp(0, 1)
         saturation = self._uniform(*shape, 1) ** 0.7 * (self._uniform(*shape, 1) > 0.33)
         return _unit(1 - 0.97 * saturation * (1 - rainbow))
 
     def _lights(self, scenery: Scenery, kind: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Strength times colour (B, K, 3) of the photo's sources and of the relit picture's; blend; far."""
+        """Return strength times colour (B, K, 3) of the photo's sources and of the relit picture's; blend;
+        far.
+        """
         count, k = scenery.usable.shape
         usable = scenery.usable.float()
         often = torch.where(scenery.world, 0.7, 0.35)
@@ -235,7 +237,7 @@ class BatchMaker:
         strength = 2 ** self._uniform(count, k, low=-2.0, high=1.0)
         lights = (on * strength)[:, :, None] * self._neutral(count, k)
         pick = F.one_hot(torch.multinomial(usable + 1e-6, 1, generator=self.generator)[:, 0], k).float()
-        # One lamp added: it is off in the photo, unless it is the only one that could be on.
+        # One lamp is added. It is off in the photo, unless it is the only lamp that could be on.
         others = on * (1 - pick)
         alone = others.sum(dim=1, keepdim=True) == 0
         is_lamp = (kind == LAMP)[:, None] & ~alone
@@ -243,7 +245,7 @@ class BatchMaker:
         lights = lights * (base / on.clamp_min(1e-6)).clamp(max=1)[:, :, None]
         lamp = 2 ** self._uniform(count, low=-2.0, high=2.5)
         added = lights + (pick * lamp[:, None])[:, :, None] * self._any(count)[:, None]
-        # One light that is on dimmed, switched off, strengthened or given another colour.
+        # One light that is on is dimmed, switched off, strengthened or given another colour.
         lit = F.one_hot(torch.multinomial(base + 1e-9, 1, generator=self.generator)[:, 0], k).float()[
             :, :, None
         ]
@@ -276,13 +278,15 @@ class BatchMaker:
         return lights, relights, blend, far
 
     def _switch(self, often: Tensor, usable: Tensor) -> Tensor:
-        """(B, K) 0 or 1: which usable sources are on; at least one."""
+        """Return (B, K) 0 or 1: which usable sources are on. At least one is on."""
         on = (self._uniform(*usable.shape) < often).float() * usable
         one = torch.multinomial(usable + 1e-6, 1, generator=self.generator)[:, 0]
         return torch.where(on.sum(dim=1, keepdim=True) > 0, on, F.one_hot(one, usable.shape[1]).float())
 
     def _exposure(self, photo: Tensor, light: Tensor) -> Tensor:
-        """(B, 3, 1, 1): brings the 95th percentile to 0.3..1.1, and the light's mean colour towards white."""
+        """Return (B, 3, 1, 1), which brings the 95th percentile to 0.3..1.1, and the light's mean colour
+        towards white.
+        """
         white = self._uniform(self.count, 1, 1, 1, low=0.3, high=1.1)
         mean = light.mean(dim=(2, 3), keepdim=True).clamp_min(1e-5)
         cast = (mean / luminance(mean)) ** -self._uniform(self.count, 1, 1, 1, low=0.2, high=1.0)
@@ -292,7 +296,10 @@ class BatchMaker:
     def _balanced(
         self, kind: Tensor, photo: Tensor, light: Tensor, relit: Tensor, target: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Replaced lights may be as strong as suits the display; added ones as strong as is usual."""
+        """Return the relit picture and the target at suitable strengths.
+
+        Replaced lights are scaled to suit the display, and added lights to the usual strength.
+        """
         white = 2 ** self._uniform(self.count, 1, 1, 1, low=-1.7, high=1.0)
         replaced = (kind == REPLACE)[:, None, None, None]
         scale = torch.where(replaced, white / bright_part(relit), torch.ones_like(white))
@@ -311,7 +318,8 @@ class BatchMaker:
     def _local(
         self, scenery: Scenery, kind: Tensor, blend: Tensor, scene: Lit, brush: Brush
     ) -> tuple[Lit, Tensor]:
-        """For LOCAL samples small lamps (or what keeps light off) before the surface that one stroke touches.
+        """Put small lamps, or objects that block light, before the surface that one stroke of LOCAL samples
+        touches.
 
         Returns the scene and the cell (B,) at which that stroke starts. A dab is a stroke without length.
         """
@@ -327,7 +335,7 @@ class BatchMaker:
         brush.flat[:] = brush.flat | lone
         mask, points = touched(brush, 0, index, scenery.ids)
         cells = cells_at(points, height, width)
-        # The side of a cell in the scene, at the start.
+        # The side of a cell in the scene, at the start of the stroke.
         cell = (at(scenery.depth, index) * self.cell_slope)[:, 0]
         distance = (
             brush.radius[:, 0].clamp_min(0.025 * self.side)
@@ -341,7 +349,7 @@ class BatchMaker:
         shape = lamps_along(scenery.position, scenery.normal, cells, distance, aside, on) * (1 - scenery.sky)
         level = (shape * mask).sum(dim=(2, 3), keepdim=True) / mask.sum(dim=(2, 3), keepdim=True).clamp_min(1)
         shape = (shape / level.clamp_min(1e-9)).clamp(max=3.0)
-        # New light, as bright under the stroke as is usual beside what lies there.
+        # New light is as bright under the stroke as is usual relative to the light there.
         there = at(luminance(scene.light), index)[:, :, None, None] + 0.1
         colour = self._any(self.count)[:, :, None, None]
         glow = there * 2 ** self._uniform(self.count, 1, 1, 1, low=-1.5, high=3.0) * colour * shape
@@ -370,7 +378,7 @@ class BatchMaker:
         brush: Brush,
         first: Tensor,
     ) -> tuple[Strokes, Lit]:
-        """The strokes; and the scene, whose change ends far from the strokes where the photo stays."""
+        """Return the strokes and the scene, whose change ends far from the strokes where the photo stays."""
         height, width = scenery.depth.shape[2], scenery.depth.shape[3]
         mode, light, target = blend[:, None, None, None], scene.light, scene.target
         value = torch.where(mode == ADD, (target - light).clamp_min(0), target)
@@ -392,8 +400,9 @@ class BatchMaker:
         return Strokes(drawn, mask, blend, far), replace(scene, relit=relit, target=target)
 
     def _interest(self, scenery: Scenery, kind: Tensor, blend: Tensor, scene: Lit, value: Tensor) -> Tensor:
-        """(B, 1, H, W): where a person would draw. Where the light changes; where all lights change, in the
-        light.
+        """Return (B, 1, H, W), where a user would draw: where the light changes.
+
+        Where all lights change, a user would draw in the light.
         """
         which = kind[:, None, None, None]
         change = torch.log((scene.target + 0.02) / (scene.light + 0.02)).abs().amax(dim=1, keepdim=True)
@@ -406,7 +415,7 @@ class BatchMaker:
     def _whole_maps(
         self, kind: Tensor, blend: Tensor, value: Tensor, drawn: Tensor, mask: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """For some samples the whole map is given, or its mean over coarse cells, some of them missing."""
+        """Give some samples the whole map, or its mean over coarse cells, some of which are missing."""
         how = self._uniform(self.count)[:, None, None, None]
         fits = ((blend == SET) & (kind != LOCAL))[:, None, None, None]
         dense = fits & (how < DENSE)
@@ -420,14 +429,15 @@ class BatchMaker:
 
 
 def mix(scenery: Scenery, lights: Tensor) -> tuple[Tensor, Tensor]:
-    """Picture and Lumi map (B, 3, H, W) of the sources at strength times colour (B, K, 3)."""
+    """Return picture and Lumi map (B, 3, H, W) of the sources at strength times colour (B, K, 3)."""
     weights = lights[:, :, :, None, None]
     return (scenery.images * weights).sum(dim=1), (scenery.lumi * weights).sum(dim=1)
 
 
 def usual(strokes: Strokes, scene: Lit) -> tuple[Strokes, Lit]:
-    """Drop the strokes of samples whose light is far beyond what people draw, or not a number; nothing
-    changes there.
+    """Drop the strokes of samples whose light is far beyond what people draw, or not finite.
+
+    Nothing changes in these samples.
     """
     most = torch.stack(
         [part.flatten(1).amax(dim=1) for part in (scene.light, scene.target, scene.relit, strokes.drawn)]
@@ -445,13 +455,13 @@ def usual(strokes: Strokes, scene: Lit) -> tuple[Strokes, Lit]:
 
 
 def bright_part(picture: Tensor) -> Tensor:
-    """(B, 1, 1, 1): the 95th percentile of the brightest channel."""
+    """Return (B, 1, 1, 1), the 95th percentile of the brightest channel."""
     flat = picture.amax(dim=1).flatten(1)[:, ::7]
     return torch.quantile(flat.float(), 0.95, dim=1)[:, None, None, None].clamp_min(1e-4)
 
 
 def data_variable(strokes: Strokes, light: Tensor, target: Tensor) -> Tensor:
-    """The flow's x0 of a target Lumi map; see `completion.Completed`."""
+    """Return the flow's x0 of a target Lumi map, see `completion.Completed`."""
     mode = strokes.blend[:, None, None, None]
     added = (target - light).clamp_min(0) / peak(strokes.drawn, strokes.mask)
     factor = torch.log(((target + 0.01) / (light + 0.01)).clamp(LEAST_FACTOR, 64))
@@ -460,6 +470,6 @@ def data_variable(strokes: Strokes, light: Tensor, target: Tensor) -> Tensor:
 
 
 def _unit(colour: Tensor) -> Tensor:
-    """(..., 3) colours scaled to luminance 1."""
+    """Return (..., 3) colours scaled to luminance 1."""
     weights = torch.tensor([0.2126, 0.7152, 0.0722], device=colour.device)
     return colour / (colour @ weights)[..., None].clamp_min(0.05)

@@ -1,7 +1,7 @@
-"""Strokes as a person might draw them, for a whole batch at once.
+"""Draw strokes as a user might, for a whole batch at once.
 
-A stroke is a polyline of a few points with a round brush. It starts where the light matters, walks on in a
-slowly turning direction, and often keeps to the object on which it started.
+A stroke is a polyline of a few points with a round brush. It starts where the light matters, continues in a
+slowly turning direction, and often stays on the object on which it started.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-POINTS = 4  # of a stroke
+POINTS = 4  # points of a stroke
 MOST = 5  # strokes of a drawing
 
 
@@ -20,8 +20,7 @@ class Brush:
     """The random choices of the strokes of a batch.
 
     count: (B,) strokes drawn, 1..MOST. radius: (B, MOST) half the width, in cells. step: (B, MOST) cells
-    between points. turn: (B, MOST, POINTS) radians. keeps: (B, MOST) whether the stroke keeps to its
-    object.
+    between points. turn: (B, MOST, POINTS) radians. keeps: (B, MOST) whether the stroke stays on its object.
     flat: (B,) whether a stroke has one value, its mean.
     """
 
@@ -34,7 +33,7 @@ class Brush:
 
 
 def random_brush(count: int, side: int, generator: Generator, device: torch.device) -> Brush:
-    """A brush for every sample of a batch."""
+    """Return a brush for every sample of a batch."""
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(count, *shape, generator=generator, device=device)
@@ -52,13 +51,14 @@ def random_brush(count: int, side: int, generator: Generator, device: torch.devi
 
 
 def starts(interest: Tensor, generator: Generator) -> Tensor:
-    """(B, MOST) cell numbers at which strokes start, in proportion to interest (B, 1, H, W) >= 0."""
+    """Return (B, MOST) cell numbers at which strokes start, in proportion to interest (B, 1, H, W) >= 0."""
     share = interest.flatten(1) + 1e-6 * interest.flatten(1).amax(dim=1, keepdim=True) + 1e-12
     return torch.multinomial(share, MOST, replacement=True, generator=generator)
 
 
 def touched(brush: Brush, k: int, start: Tensor, ids: Tensor) -> tuple[Tensor, Tensor]:
-    """The mask (B, 1, H, W) of stroke k from cells `start` (B,), and its points (B, POINTS, 2) of x and y.
+    """Return the mask (B, 1, H, W) of stroke k from cells `start` (B,), and its points (B, POINTS, 2) of x
+    and y.
 
     ids: (B, 1, H, W) object numbers.
     """
@@ -72,10 +72,10 @@ def touched(brush: Brush, k: int, start: Tensor, ids: Tensor) -> tuple[Tensor, T
 
 
 def draw(brush: Brush, value: Tensor, start: Tensor, ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Strokes of a value (B, 3, H, W) from cells `start` (B, MOST).
+    """Return strokes of a value (B, 3, H, W) from cells `start` (B, MOST).
 
-    Returns drawn light, mask (B, 1, H, W), and the points (B, MOST, POINTS, 2) of all strokes; those of
-    strokes that are not drawn repeat the first stroke's.
+    The result is drawn light, mask (B, 1, H, W), and the points (B, MOST, POINTS, 2) of all strokes. Strokes
+    that are not drawn repeat the points of the first stroke.
     """
     drawn, mask = torch.zeros_like(value), torch.zeros_like(value[:, :1])
     paths: list[Tensor] = []
@@ -94,14 +94,14 @@ def draw(brush: Brush, value: Tensor, start: Tensor, ids: Tensor) -> tuple[Tenso
 
 
 def walk(start: Tensor, step: Tensor, turn: Tensor) -> Tensor:
-    """(B, POINTS, 2): the points of a stroke from its start."""
+    """Return (B, POINTS, 2), the points of a stroke from its start."""
     angle = turn.cumsum(dim=1)
     moves = step[:, None, None] * torch.stack([torch.cos(angle), torch.sin(angle)], dim=2)
     return start[:, None] + torch.cat([torch.zeros_like(moves[:, :1]), moves[:, 1:].cumsum(dim=1)], dim=1)
 
 
 def distance(points: Tensor, height: int, width: int) -> Tensor:
-    """(B, H, W): the distance in cells from every cell's centre to a polyline (B, P, 2) of x and y."""
+    """Return (B, H, W), the distance in cells from every cell's centre to a polyline (B, P, 2) of x and y."""
     y = torch.arange(height, device=points.device, dtype=points.dtype)[:, None] + 0.5
     x = torch.arange(width, device=points.device, dtype=points.dtype)[None, :] + 0.5
     nearest = None

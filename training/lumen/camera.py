@@ -1,9 +1,10 @@
-"""A batched camera: what carries linear renders towards real photos. The twin of the picture style in
-`camera.Camera`.
+"""A batched camera, which makes linear renders resemble real photos.
+
+It has the same picture style as `camera.Camera`.
 
     linear light -> blur -> noise -> picture style -> sharpening -> 8 bits
 
-The style shapes photo and relit picture alike; everything else befalls the photo alone.
+The style applies to photo and relit picture alike. All other stages apply only to the photo.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from torch import Generator, Tensor
 
 from dior_rt.training.lumen.optics import blur, linear_to_srgb, luminance
 
-PLAIN_SHARE = 0.3  # of cameras that do nothing but encode
+PLAIN_SHARE = 0.3  # share of cameras that do nothing but encode
 
 
 @dataclass(frozen=True)
 class Cameras:
     """One camera per sample, each field (B, 1, 1, 1).
 
-    gamma: v ** gamma of the encoded value. contrast: of an S-curve. lift: what black becomes.
-    saturation: about the luma. noise: standard deviation at white, falling with the root of the light.
-    sharpening: the share of what a blur of 0.7 cells takes away that is added.
+    gamma: v ** gamma of the encoded value. contrast: the strength of an S-curve. lift: the value of black.
+    saturation: relative to the luma. noise: standard deviation at white, which falls with the root of the
+    light. sharpening: the share of the detail lost to a blur of 0.7 cells that is added.
     """
 
     gamma: Tensor
@@ -35,14 +36,14 @@ class Cameras:
     sharpening: Tensor
 
     def develop(self, linear: Tensor) -> Tensor:
-        """The picture of linear light (B, 3, H, W), encoded, in 0..1, not rounded."""
+        """Return the picture of linear light (B, 3, H, W), encoded, in 0..1, not rounded."""
         v = linear_to_srgb(linear.clamp(0, 1)) ** self.gamma
         v = v + self.contrast * (v * v * (3 - 2 * v) - v)
         v = self.lift + (1 - self.lift) * v
         return (v + (self.saturation - 1) * (v - luminance(v))).clamp(0, 1)
 
     def shoot(self, linear: Tensor, generator: Generator) -> Tensor:
-        """The photo of linear light: multiples of 1/255 in 0..1."""
+        """Return the photo of linear light: multiples of 1/255 in 0..1."""
         grain = torch.randn(linear.shape, generator=generator, device=linear.device)
         deviation = self.noise * torch.sqrt(linear.clamp(0, 1) + 0.02)
         photo = self.develop(linear + deviation * grain)
@@ -51,7 +52,7 @@ class Cameras:
 
 
 def random_cameras(count: int, generator: Generator, device: torch.device) -> Cameras:
-    """Cameras such as people own: mild in style."""
+    """Return cameras of common kinds, mild in style."""
 
     def uniform(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(count, 1, 1, 1, generator=generator, device=device)

@@ -1,7 +1,8 @@
-"""Checkpoints: one file for a network, or a folder of small files for a run.
+"""Read and write checkpoints: one file for a network, or a folder of small files for a run.
 
-A folder holds the weights' average (float16), what the optimiser needs to go on, and the index state.json,
-each in files of at most PART bytes, so that they can be moved one by one. The average alone is a network.
+A folder holds the weights' average (float16), the state that the optimiser needs to resume, and the index
+state.json, each in files of at most PART bytes, so that they can be moved one by one. The average alone is a
+network.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from dior_rt.training.lumen.model import Lumen
 INDEX: Final = "state.json"
 AVERAGE: Final = "average"
 STATE: Final = "state"
-PART: Final = 15_000_000  # bytes of a file
+PART: Final = 15_000_000  # bytes per file
 
 
 def save_lumen(network: Lumen, path: Path, half: bool = False) -> None:
-    """Weights as safetensors, the configuration in its header; written whole, or InputError raised."""
+    """Write weights as safetensors, with the configuration in the header, whole or not at all.
+
+    Raises InputError.
+    """
     weights = {
         name: (weight.detach().cpu().half() if half else weight.detach().cpu()).contiguous()
         for name, weight in network.state_dict().items()
@@ -37,7 +41,7 @@ def save_lumen(network: Lumen, path: Path, half: bool = False) -> None:
 
 
 def load_lumen(path: Path) -> Lumen:
-    """Return the network of a file that `save_lumen` wrote, or of the folder of a training run (its average).
+    """Return the network in a file that `save_lumen` wrote, or in the folder of a training run (its average).
 
     Half-precision weights become float32. Raises InputError for a checkpoint that is missing or damaged.
     """

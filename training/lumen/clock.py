@@ -1,4 +1,4 @@
-"""How far a training run is: its learning rate follows, whether the run is planned by time or by steps."""
+"""The progress of a training run, planned by time or by steps. The learning rate follows it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Clock:
 
     @property
     def average_share(self) -> float:
-        """Return by how much the weights' average moves towards the weights in this step."""
+        """Return the factor by which the weights' average moves towards the weights in this step."""
         total: float = self.steps
         if self.minutes is not None:
             total = max((self.taken + 1) / max(self.done, 1e-3), 50.0)
@@ -72,7 +72,7 @@ class Clock:
 
 
 def seconds_since_start() -> float:
-    """Return how long this process has run; 0 where the system does not say."""
+    """Return how long this process has run, or 0 where the system does not report it."""
     try:
         ticks = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19])
         uptime = float(Path("/proc/uptime").read_text().split()[0])

@@ -1,15 +1,14 @@
-"""Complete the light: from strokes and a scene to the whole Lumi map that was meant.
+"""Complete the light: predict the whole Lumi map that the user meant from strokes and a scene.
 
-One network serves three blend modes. It answers with four maps: how much of the photo's own light is kept,
-how bright the new light is (by orientation, as in `scene`), which of the drawn colours it has, and how far
-a factor
-reaches:
+One network serves three blend modes. Its head returns four maps: the share of the photo's own light that is
+kept, the brightness of the new light (by orientation, as in `scene`), its mixture of the drawn colours, and
+the reach of a factor:
 
     set        target = light * keep + new
-    add        target = light + new * peak(drawn)          so it is linear in the drawn value and never
-    darkens multiply   target = light * exp(reach * log drawn)
+    add        target = light + new * peak(drawn)        (linear in the drawn value; it never darkens)
+    multiply   target = light * exp(reach * log drawn)
 
-Where something is drawn the drawn value holds in the mean: see `hold`.
+Where something is drawn, the drawn value holds in the mean: see `hold`.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ SCENE: Final = 3 + 3 + 1 + 1 + 3  # photo, normal, depth, sky, light
 MODES: Final = 6  # three blends, each with or without light far from the strokes
 HIDING_RATIO: Final = 0.1  # noise ten times as strong as the image hides half of the state
 HOLD: Final = 0.03  # of the grid's side: how finely the drawn value holds
-EDGE: Final = 0.2  # share of drawn cells around one at which half of the correction is left
+EDGE: Final = 0.2  # share of drawn cells around a cell at which half of the correction is left
 FACTOR_SCALE: Final = 1 / 2.0  # of a log factor in the flow's data variable
 
 
@@ -58,7 +57,7 @@ class Strokes(NamedTuple):
 
 
 class Completed(NamedTuple):
-    """The light that strokes ask for."""
+    """The light that the strokes ask for."""
 
     target: Tensor  # (B, 3, H, W) the target Lumi map, linear
     factor: Tensor  # (B, 3, H, W) logarithm of a factor on the light as it is seen; 0 but for `multiply`
@@ -96,7 +95,7 @@ class LightNetwork(nn.Module):
             self.head.bias[5] = 2.0  # type: ignore[index]  # of the colour drawn nearby
 
     def forward(self, x: Tensor, sigma: Tensor, photo: Tensor, scene: Scene, strokes: Strokes) -> Completed:
-        """x: (B, 3, H, W) the flow's state at times sigma (B,)."""
+        """Return the completed light. x: (B, 3, H, W), the flow's state at times sigma (B,)."""
         rows, columns = photo.shape[2] // PATCH, photo.shape[3] // PATCH
         features, colours = stroke_features(strokes.drawn, strokes.mask, strokes.blend, scene.light)
         clear = clarity(sigma)
@@ -109,7 +108,7 @@ class LightNetwork(nn.Module):
         half = self.to_half(fine, scene.half)  # (B, half, H / 2, W / 2)
         quarter = self.to_quarter(half, scene.quarter)  # (B, quarter, H / 4, W / 4)
         grid = self.to_tokens(quarter, scene.tokens)  # (B, width, H / 8, W / 8)
-        visible_time = 1 - (1 - sigma) * clear  # where the state says nothing, neither does the time
+        visible_time = 1 - (1 - sigma) * clear  # a state without information hides the time, too
         condition = F.silu(self.time(waves(visible_time, self.config.width)) + self.mode(mode))
         modulation = self.modulation(condition).unflatten(1, (6, -1))  # (B, 6, width)
         tokens = grid.flatten(2).transpose(1, 2)
@@ -124,7 +123,7 @@ class LightNetwork(nn.Module):
 
 
 def compose(maps: Tensor, colours: Tensor, scene: Scene, strokes: Strokes) -> Completed:
-    """The light that the head's maps (B, 10, H, W) describe."""
+    """Return the light that the head's maps (B, 10, H, W) describe."""
     keep, oriented, shares, reach = maps.split((1, ORIENTATION, PALETTE, 1), dim=1)
     drawn, mask, light = strokes.drawn, strokes.mask, scene.light
     mode = strokes.blend[:, None, None, None]
@@ -146,7 +145,9 @@ def compose(maps: Tensor, colours: Tensor, scene: Scene, strokes: Strokes) -> Co
 
 
 def _factor(reach: Tensor, drawn: Tensor, mask: Tensor) -> Tensor:
-    """The logarithm of the factor everywhere: the drawn one nearby, as far as `reach` lets it go."""
+    """Return the logarithm of the factor everywhere: the drawn factor nearby, as far as `reach` lets it
+    extend.
+    """
     wanted = log_factor(drawn)
     near, far = spread(wanted, mask, NEAR * SIDE, 1e-6), spread(wanted, mask, FAR * SIDE, 1e-6)
     share = spread(torch.ones_like(mask), mask, NEAR * SIDE, LITTLE)
@@ -155,9 +156,9 @@ def _factor(reach: Tensor, drawn: Tensor, mask: Tensor) -> Tensor:
 
 
 def hold(light: Tensor, drawn: Tensor, mask: Tensor) -> Tensor:
-    """Light (B, 3, H, W) corrected so that under the mask it is what was drawn, in the mean over a few cells.
+    """Return light (B, 3, H, W) that equals the drawn light under the mask, in the mean over a few cells.
 
-    The correction is a ratio that varies slowly, so the form that shades the light under a stroke stays.
+    The correction is a ratio that varies slowly, so it preserves the shading of the light under a stroke.
     """
     error = log_light(drawn) - log_light(light)
     corrected = log_light(light) + held(error, mask)
@@ -169,7 +170,7 @@ def _from_log(logarithm: Tensor) -> Tensor:
 
 
 def held(error: Tensor, mask: Tensor) -> Tensor:
-    """A slowly varying correction that removes the error under the mask and fades out beside it."""
+    """Return a slowly varying correction that removes the error under the mask and fades out beside it."""
     beside = spread(torch.ones_like(mask), mask, HOLD * SIDE, EDGE) * (1 + EDGE)
     amount = torch.maximum(mask, beside.clamp(max=1))
     correction = torch.zeros_like(error)
@@ -179,6 +180,6 @@ def held(error: Tensor, mask: Tensor) -> Tensor:
 
 
 def clarity(sigma: Tensor) -> Tensor:
-    """(B,) in 0..1: how far a state is looked at. Next to noise it can say nothing of the answer."""
+    """Return (B,) in 0..1, the weight of a state. Near noise it contains no information about the answer."""
     image, noise = (1 - sigma) ** 2, (HIDING_RATIO * sigma) ** 2
     return image / (image + noise)

@@ -27,7 +27,7 @@ from dior_rt.training.lumen.run import Run
 
 SIZES: Final = LumenConfig()
 TRIED: Final = 15  # steps after which a compiled network must have had finite gradients
-SHOWN: Final = 20  # steps between two looks at the errors on a GPU, which has to be waited for
+SHOWN: Final = 20  # steps between two looks at the errors on a GPU, because a look waits for it
 
 Progress = Callable[[int, float, dict[str, float]], None]  # step, share done, running errors
 Step = Callable[[Batch, Tensor, Tensor], dict[str, Tensor]]
@@ -35,7 +35,7 @@ Step = Callable[[Batch, Tensor, Tensor], dict[str, Tensor]]
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to train.
+    """The options of training.
 
     minutes: of training, loading and compiling included; None: `steps` decide.
     steps: of the optimiser, where minutes is None.
@@ -75,11 +75,12 @@ def fit(
     start: Path | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Train on the shards in `packs`; the folder `out` receives the state in parts and resumes from it.
+    """Train on the shards in `packs`. The folder `out` receives the state in parts, and training resumes from
+    it.
 
-    sizes: of a new network. start: the checkpoint of another run to go on from instead, with a new schedule.
-    backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new materials.
-    Raises InputError for files that cannot be used, and where training diverges.
+    sizes: of a new network. start: the checkpoint of another run to continue from instead, with a new
+    schedule. backbone: ImageNet weights for the features. surfaces: a folder of surface sheets, for new
+    materials. Raises InputError for files that cannot be used, and where training diverges.
     """
     views = load_shards(packs)
     make_folder(out)
@@ -112,7 +113,9 @@ def fit(
 
 @dataclass
 class Watch:
-    """Running means of the errors, how many steps had no finite gradient, and when the run was last saved."""
+    """Running means of the errors, the number of steps without a finite gradient, and the time of the last
+    save.
+    """
 
     device: torch.device
     running: dict[str, float] = field(default_factory=dict)
@@ -123,7 +126,7 @@ class Watch:
         self.skipped = torch.zeros((), device=self.device)
 
     def look(self, errors: dict[str, Tensor], clock: Clock) -> None:
-        """Take in a step's errors. Raises InputError where most gradients are not finite."""
+        """Add a step's errors. Raises InputError where most gradients are not finite."""
         for name, error in errors.items():
             value = float(error)
             if math.isfinite(value):
@@ -143,7 +146,7 @@ def prepare_device() -> torch.device:
 
 
 def states(batch: Batch, config: FitConfig, number: int) -> tuple[Tensor, Tensor]:
-    """Return states of x0 and their flow times (B,); most are pure noise, where sampling starts."""
+    """Return states of x0 and their flow times (B,). Most are pure noise, where sampling starts."""
     count, device = len(batch.photo), batch.photo.device
     generator = torch.Generator(device=device).manual_seed(config.seed * 7_919 + number)
     u = torch.rand(count, generator=generator, device=device)

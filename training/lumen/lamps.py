@@ -1,9 +1,8 @@
-"""A small lamp set close before the surface that a dab touches, computed from a view's positions and normals.
+"""Compute the light of a small lamp close before the surface that a dab touches, from positions and normals.
 
-A lone dab says little about the rest of the picture, so its light has to have a cause of its own: a lamp
-whose light falls off with the square of the distance and with the angle to each surface. A wall behind the
-object is
-farther from it than the object's own surface, so the light belongs to the object.
+A lone dab gives little information about the rest of the picture, so its light needs a cause: a lamp whose
+light falls off with the square of the distance and with the angle to each surface. A wall behind the object
+is farther from the lamp than the object's own surface, so the light belongs to the object.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ from torch import Tensor
 
 
 def positions(depth: Tensor, slope: Tensor, frame: Tensor) -> Tensor:
-    """(B, 3, H, W) camera-space positions: x right, y up, z towards the camera (negative before it).
+    """Return (B, 3, H, W) camera-space positions: x right, y up, z towards the camera (negative before it).
 
     depth: (B, 1, H, W) along the view axis. slope: (B,) tangent of half the angle of view. frame: (B, 2, H,
-    W) where each cell lies in the full square picture, -1..1, x to the right and y up.
+    W), the place of each cell in the full square picture, -1..1, x to the right and y up.
     """
     return torch.cat([frame * slope[:, None, None, None] * depth, -depth], dim=1)
 
@@ -35,13 +34,13 @@ def lamp_light(position: Tensor, normal: Tensor, lamp: Tensor, size: Tensor) -> 
 
 
 def at(cells: Tensor, index: Tensor) -> Tensor:
-    """(B, C): the values of (B, C, H, W) at flat cell numbers (B,)."""
+    """Return (B, C), the values of (B, C, H, W) at flat cell numbers (B,)."""
     flat = cells.flatten(2)
     return flat.gather(2, index[:, None, None].expand(-1, flat.shape[1], 1))[:, :, 0]
 
 
 def cells_at(points: Tensor, height: int, width: int) -> Tensor:
-    """(B, P): the cell numbers of points (B, P, 2) of x and y, moved into the picture."""
+    """Return (B, P), the cell numbers of points (B, P, 2) of x and y, moved into the picture."""
     x = points[..., 0].long().clamp(0, width - 1)
     y = points[..., 1].long().clamp(0, height - 1)
     return y * width + x
@@ -50,9 +49,10 @@ def cells_at(points: Tensor, height: int, width: int) -> Tensor:
 def lamps_along(
     position: Tensor, normal: Tensor, cells: Tensor, height: Tensor, aside: Tensor, on: Tensor
 ) -> Tensor:
-    """(B, 1, H, W): the light of lamps over the cells (B, P), each `height` (B,) along the normal there.
+    """Return (B, 1, H, W), the light of lamps over the cells (B, P), each at `height` (B,) along the normal
+    there.
 
-    aside: (B, 3) moves every lamp, in heights. on: (B, P) which of them shine.
+    aside: (B, 3) moves every lamp, in heights. on: (B, P), which of them shine.
     """
     total = torch.zeros_like(position[:, :1])
     for k in range(cells.shape[1]):
@@ -62,7 +62,7 @@ def lamps_along(
 
 
 def nearest(position: Tensor, cells: Tensor) -> Tensor:
-    """(B, 1, H, W): the distance in the scene from every cell to the nearest of the cells (B, P)."""
+    """Return (B, 1, H, W), the distance in the scene from every cell to the nearest of the cells (B, P)."""
     least = None
     for k in range(cells.shape[1]):
         squared = (position - at(position, cells[:, k])[:, :, None, None]).square().sum(dim=1, keepdim=True)

@@ -1,5 +1,5 @@
-"""The building blocks: transformer blocks over tokens, residual convolutions over cells, and ways between
-the strides.
+"""The building blocks: transformer blocks over tokens, residual convolutions over cells, and changes of
+stride.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def _norm(tokens: Tensor) -> Tensor:
 
 
 def rotations(rows: int, columns: int, size: int, device: torch.device) -> Turns:
-    """Cosine and sine (rows * columns, size / 2) of the rotary position code (RoPE, arXiv 2104.09864).
+    """Return cosine and sine (rows * columns, size / 2) of the rotary position code (RoPE, arXiv 2104.09864).
 
-    Half of the pairs turn with the row, half with the column, so any shape of grid works.
+    Half of the pairs depend on the row, half on the column, so any shape of grid works.
     """
     frequency = torch.exp(-math.log(100.0) * torch.arange(size // 4, device=device) / (size // 4))
     down = (torch.arange(rows, device=device)[:, None] * frequency)[:, None, :].expand(
@@ -69,7 +69,7 @@ def rotations(rows: int, columns: int, size: int, device: torch.device) -> Turns
 
 
 def rotate(part: Tensor, turns: Turns) -> Tensor:
-    """Turn the pairs (part[i], part[i + size / 2]) of (B, H, N, size) by their position's angles."""
+    """Rotate the pairs (part[i], part[i + size / 2]) of (B, H, N, size) by their position's angles."""
     cosine, sine = turns
     a, b = part.chunk(2, dim=-1)
     return torch.cat([a * cosine - b * sine, a * sine + b * cosine], dim=-1)
@@ -93,7 +93,7 @@ class Residual(nn.Module):
 
 
 class Down(nn.Module):
-    """Halve both sides: (B, C, h, w) to (B, out, h / 2, w / 2), with room for features from elsewhere."""
+    """Halve both sides: (B, C, h, w) -> (B, out, h / 2, w / 2), with channels left for other features."""
 
     def __init__(self, channels: int, out: int, extra: int = 0) -> None:
         super().__init__()
@@ -109,7 +109,7 @@ class Down(nn.Module):
 
 
 class Up(nn.Module):
-    """Double both sides and add a skip: (B, C, h, w) and (B, out, 2 h, 2 w) to (B, out, 2 h, 2 w)."""
+    """Double both sides and add a skip: (B, C, h, w) and (B, out, 2 h, 2 w) -> (B, out, 2 h, 2 w)."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -121,7 +121,7 @@ class Up(nn.Module):
 
 
 def waves(sigma: Tensor, width: int) -> Tensor:
-    """(B,) flow times to (B, width) sinusoids of 1 to 10 rad over 0..1."""
+    """Return sinusoids (B, width) of flow times (B,), of 1 to 10 rad over 0..1."""
     frequency = torch.exp(torch.linspace(0.0, math.log(10.0), width // 2, device=sigma.device))
     angle = sigma[:, None] * frequency
     return torch.cat([torch.cos(angle), torch.sin(angle)], dim=1)

@@ -1,4 +1,4 @@
-"""What training minimises: errors of the scene maps, of the completed light, and of the relit picture."""
+"""The training loss: errors of the scene maps, of the completed light, and of the relit picture."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from dior_rt.training.lumen.scene import Scene
 from dior_rt.training.lumen.shading import shown
 from dior_rt.training.lumen.strokes import SET
 
-SCALES = 4  # of gradients: 1, 2, 4 and 8 cells
+SCALES = 4  # of gradients, in cells
 
 
 @dataclass(frozen=True)
 class Weights:
-    """How much each error counts."""
+    """The weight of each error."""
 
     light: float = 1.0  # of the photo's own light: its logarithm and the gradients of it
     chroma: float = 1.0  # of its colour, more
@@ -37,7 +37,7 @@ class Weights:
 def loss(
     scene: Scene, completed: Completed, relit: Tensor, batch: Batch, weights: Weights = Weights()
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The sum of the weighted errors, and each error by name."""
+    """Return the sum of the weighted errors, and each error by name."""
     truth = batch.truth
     errors = scene_errors(scene, truth) | light_errors(completed, batch) | picture_errors(relit, truth)
     total = sum(
@@ -48,7 +48,7 @@ def loss(
 
 
 def scene_errors(scene: Scene, truth: Truth) -> dict[str, Tensor]:
-    """Errors of what is read from the photo."""
+    """Return the errors of the scene that is read from the photo."""
     ground = 1 - truth.sky
     seen = ground.mean().clamp_min(1e-3)
     error = log_light(scene.light) - log_light(truth.light)
@@ -68,7 +68,7 @@ def scene_errors(scene: Scene, truth: Truth) -> dict[str, Tensor]:
 
 
 def light_errors(completed: Completed, batch: Batch) -> dict[str, Tensor]:
-    """Errors of the completed light, in the terms of each sample's blend mode."""
+    """Return the errors of the completed light, in the terms of each sample's blend mode."""
     mode = batch.strokes.blend[:, None, None, None]
     error = torch.where(
         mode == SET,
@@ -82,7 +82,7 @@ def light_errors(completed: Completed, batch: Batch) -> dict[str, Tensor]:
 
 
 def picture_errors(relit: Tensor, truth: Truth) -> dict[str, Tensor]:
-    """Errors of the relit picture, sRGB-encoded. The photo's noise belongs to both."""
+    """Return the errors of the relit picture, sRGB-encoded. Both pictures contain the photo's noise."""
     error = shown(relit) - truth.relit
     return {
         "picture": error.square().mean(),
@@ -91,7 +91,7 @@ def picture_errors(relit: Tensor, truth: Truth) -> dict[str, Tensor]:
 
 
 def gradients(error: Tensor) -> Tensor:
-    """Mean absolute differences between neighbours, at several scales."""
+    """Return mean absolute differences between neighbours, at several scales."""
     total = torch.zeros_like(error[0, 0, 0, 0])
     for k in range(SCALES):
         total = total + error.diff(dim=2).abs().mean() + error.diff(dim=3).abs().mean()

@@ -1,7 +1,7 @@
 """New materials for rendered views: every object is tinted, and some get the texture of a real surface.
 
-A picture is about albedo times light, so a factor on an object's albedo is the same factor on its pictures.
-The Lumi map does not change: the network learns that light does not depend on the material.
+A picture is approximately albedo times light, so a factor on an object's albedo is the same factor on its
+pictures. The Lumi map does not change: the network learns that light does not depend on the material.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dior_rt.training.lumen.optics import srgb_to_linear
 
 OBJECTS = 256
 TILE = 128
-KEPT = 0.35  # share of samples whose materials stay
-TEXTURED = 0.3  # share of the objects of the others that get a texture
+KEPT = 0.35  # share of samples whose materials stay unchanged
+TEXTURED = 0.3  # share of the objects in the other samples that get a texture
 
 
 def load_tiles(folder: Path, most: int = 1024) -> Tensor:
@@ -40,7 +40,7 @@ def load_tiles(folder: Path, most: int = 1024) -> Tensor:
 
 
 def factors(ids: Tensor, tiles: Tensor, generator: Generator) -> Tensor:
-    """(B, 3, H, W): what each cell's albedo is multiplied by. ids: (B, 1, H, W) object numbers."""
+    """Return (B, 3, H, W), the factor on each cell's albedo. ids: (B, 1, H, W) object numbers."""
     count, device = ids.shape[0], ids.device
 
     def uniform(*shape: int) -> Tensor:
@@ -61,7 +61,7 @@ def factors(ids: Tensor, tiles: Tensor, generator: Generator) -> Tensor:
 
 
 def textures(tiles: Tensor, count: int, side: int, generator: Generator) -> Tensor:
-    """(B, 3, side, side): a turned and scaled tile for each sample, of mean 1 in each channel's picture."""
+    """Return (B, 3, side, side), a turned and scaled tile for each sample, with mean 1 in each channel."""
     device = tiles.device
     which = torch.randint(len(tiles), (count,), generator=generator, device=device)
     tile = srgb_to_linear(tiles[which].float() / 255) + 0.02

@@ -1,4 +1,4 @@
-"""Lumen: the scene network and the light network, and the picture that follows."""
+"""Lumen: the scene network, the light network, and the picture that results."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from dior_rt.training.lumen.shading import log_ratio, relight
 
 
 class Lumen(nn.Module):
-    """photo -> scene (once a photo); scene and strokes -> completed light (every step of the flow) ->
-    picture.
+    """The whole network.
+
+    photo -> scene (once per photo)
+    scene and strokes -> completed light (every step of the flow) -> picture
     """
 
     def __init__(self, config: LumenConfig) -> None:
@@ -25,14 +27,14 @@ class Lumen(nn.Module):
     def forward(
         self, x: Tensor, sigma: Tensor, photo: Tensor, strokes: Strokes
     ) -> tuple[Scene, Completed, Tensor]:
-        """The scene, the completed light, and the relit picture, linear and not clipped."""
+        """Return the scene, the completed light, and the relit picture, linear and not clipped."""
         scene = self.scene(photo)
         return scene, *self.answer(x, sigma, photo, scene, strokes)
 
     def answer(
         self, x: Tensor, sigma: Tensor, photo: Tensor, scene: Scene, strokes: Strokes
     ) -> tuple[Completed, Tensor]:
-        """The completed light and the relit picture of a scene that is known."""
+        """Return the completed light and the relit picture of a scene from an earlier call."""
         completed = self.light(x, sigma, photo, scene, strokes)
         ratio = log_ratio(
             scene.light, completed.target / torch.exp(completed.factor), scene.bounce, completed.factor

@@ -14,13 +14,16 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
 
 
 def srgb_to_linear(encoded: Tensor) -> Tensor:
-    """IEC 61966-2-1, for values in 0..1."""
+    """Return linear light (IEC 61966-2-1) of values in 0..1."""
     curve = ((encoded.clamp_min(0.04) + 0.055) / 1.055) ** 2.4
     return torch.where(encoded <= 0.04045, encoded / 12.92, curve)
 
 
 def linear_to_srgb(linear: Tensor) -> Tensor:
-    """IEC 61966-2-1, for values in 0..1; the straight part near black goes on below 0."""
+    """Return encoded values (IEC 61966-2-1) of light in 0..1.
+
+    The straight part near black continues below 0.
+    """
     curve = 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
 
@@ -36,32 +39,33 @@ def decode_light(encoded: Tensor) -> Tensor:
 
 
 def luminance(colour: Tensor) -> Tensor:
-    """(B, 3, ...) to (B, 1, ...)."""
+    """Return luminance: (B, 3, ...) -> (B, 1, ...)."""
     red, green, blue = LUMINANCE
     return red * colour[:, 0:1] + green * colour[:, 1:2] + blue * colour[:, 2:3]
 
 
 def log_light(light: Tensor) -> Tensor:
-    """The logarithm in which errors of light are measured; finite in the dark."""
+    """Return the logarithm in which errors of light are measured. It is finite in the dark."""
     return torch.log(light + BOUNCED)
 
 
 def gaussian_matrix(size: int, deviation: Tensor | float, like: Tensor) -> Tensor:
-    """(size, size): row i holds the weights of all cells for cell i, which sum to 1."""
+    """Return (size, size): row i holds the weights of all cells for cell i, which sum to 1."""
     place = torch.arange(size, dtype=torch.float32, device=like.device)
     weights = torch.exp(-0.5 * ((place[:, None] - place) / deviation) ** 2)
     return (weights / weights.sum(dim=1, keepdim=True)).to(like.dtype)
 
 
 def blur(cells: Tensor, deviation: float) -> Tensor:
-    """Blur (B, C, H, W) by a Gaussian of `deviation` cells; the border's weights are normalised."""
+    """Blur (B, C, H, W) by a Gaussian of `deviation` cells. The border's weights are normalised."""
     down = gaussian_matrix(cells.shape[2], deviation, cells)
     across = gaussian_matrix(cells.shape[3], deviation, cells)
     return down @ cells @ across.T
 
 
 def spread(values: Tensor, mask: Tensor, deviation: float, least: float = 1e-3) -> Tensor:
-    """The mean of masked values around every cell (normalised convolution), fading to 0 far from the mask.
+    """Return the mean of masked values around every cell (normalised convolution), fading to 0 far from the
+    mask.
 
     values: (B, C, H, W). mask: (B, 1, H, W) in 0..1. least: the share of drawn cells at which half remains.
     """
@@ -70,7 +74,10 @@ def spread(values: Tensor, mask: Tensor, deviation: float, least: float = 1e-3) 
 
 
 def double(cells: Tensor) -> Tensor:
-    """Bilinear resampling to twice the sides, as slices: its gradient needs no scattered additions."""
+    """Resample bilinearly to twice the sides.
+
+    It uses slices, so its gradient needs no scattered additions.
+    """
     for dim in (2, 3):
         first, last = cells.narrow(dim, 0, 1), cells.narrow(dim, cells.shape[dim] - 1, 1)
         before = torch.cat([first, cells.narrow(dim, 0, cells.shape[dim] - 1)], dim=dim)

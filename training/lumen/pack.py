@@ -1,8 +1,8 @@
-"""Renders to shards that fit through a narrow door: one zip of pictures for many views, some 25 KB a view.
+"""Pack renders into small shards: one zip of pictures for many views, about 25 KB per view.
 
-A view is two AVIF sheets (colour: the picture under every source, the environment's Lumi map, normals and
-albedo;
-grey: the lamps' Lumi maps and depth), a lossless PNG of object numbers, and a JSON head.
+A view is two AVIF sheets, a lossless PNG of object numbers, and a JSON head. The colour sheet holds the
+picture under every source, the environment's Lumi map, normals and albedo. The grey sheet holds the lamps'
+Lumi maps and depth.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from dior_rt.training.blender.store import load_view
 from dior_rt.training.lumen.optics import linear_to_srgb
 from dior_rt.training.lumen.views import Views, to_code
 
-LARGEST = 55_000_000  # bytes of a shard
-COLUMNS = 4  # tiles a row of a sheet
+LARGEST = 55_000_000  # bytes per shard
+COLUMNS = 4  # tiles per row of a sheet
 COLOUR_QUALITY = 78
 GREY_QUALITY = 82
 SKY = 255
@@ -39,7 +39,7 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Rendered:
-    """One view as a renderer leaves it, linear float32."""
+    """One view as a renderer writes it, linear float32."""
 
     name: str
     images: NDArray[np.float32]  # (K, H, W, 3)
@@ -54,7 +54,7 @@ class Rendered:
 
 
 def rendered(path: Path) -> Rendered:
-    """A view that `dior_rt.training.blender` stored. Raises InputError."""
+    """Return a view that `dior_rt.training.blender` stored. Raises InputError."""
     view = load_view(path)
     sky = view.sky.astype(np.float32) > 0.5
     lumi = view.lumi_maps().astype(np.float32)
@@ -74,7 +74,7 @@ def rendered(path: Path) -> Rendered:
 
 
 def sheet(tiles: NDArray[np.uint8]) -> Bytes:
-    """(N, H, W, C) tiles, row by row, as one picture."""
+    """Return (N, H, W, C) tiles, row by row, as one picture."""
     rows = -(-len(tiles) // COLUMNS)
     blank = np.zeros((rows * COLUMNS, *tiles.shape[1:]), np.uint8)
     blank[: len(tiles)] = tiles
@@ -89,7 +89,7 @@ def tiles_of(picture: Bytes, side: int) -> Bytes:
 
 
 def encode_view(view: Rendered) -> dict[str, bytes]:
-    """The files of a view, by name."""
+    """Return the files of a view, by name."""
     image_most = np.array([max(float(np.quantile(i, 0.9998)), 1e-6) for i in view.images], np.float32)
     lumi_most = np.array([max(float(np.quantile(i, 0.9998)), 1e-6) for i in view.lumi], np.float32)
 
@@ -141,7 +141,10 @@ def write_shards(
     most: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Path]:
-    """Write `shard-000.zip` and so on, each of at most `largest` bytes; `most`: how many shards at most."""
+    """Write `shard-000.zip` and so on, each of at most `largest` bytes.
+
+    `most`: the maximum number of shards.
+    """
     out.mkdir(parents=True, exist_ok=True)
     paths: list[Path] = []
     archive: zipfile.ZipFile | None = None
@@ -171,7 +174,7 @@ def _encoded(views: Iterable[Rendered]) -> Iterator[dict[str, bytes]]:
 
 
 def load_shards(folder: Path) -> Views:
-    """All views of a folder of shards. Raises InputError where there is none."""
+    """Return all views of a folder of shards. Raises InputError where there is none."""
     paths = sorted(folder.glob("shard-*.zip"))
     if not paths:
         raise InputError(f"There are no shards in {folder}. Make some with `dior-rt train lumen pack`.")
@@ -192,7 +195,7 @@ def load_shards(folder: Path) -> Views:
 
 
 def decode_view(files: dict[str, bytes]) -> dict[str, Tensor]:
-    """One view's tensors, in the fields of `Views` without the first axis."""
+    """Return one view's tensors, in the fields of `Views` without the first axis."""
     head = json.loads(files["head.json"])
     side, count = int(head["side"]), int(head["sources"])
     world = np.array(head["world"], bool)

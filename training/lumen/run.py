@@ -16,12 +16,12 @@ from dior_rt.training.lumen.checkpoint import AVERAGE, INDEX, STATE, read_parts,
 from dior_rt.training.lumen.clock import Clock
 from dior_rt.training.lumen.model import Lumen
 
-BACKBONE_RATE: Final = 0.25  # of the rate: pretrained weights move less
+BACKBONE_RATE: Final = 0.25  # factor on the learning rate: pretrained weights move less
 
 
 @dataclass
 class Run:
-    """What changes while a network trains. average: of the weights, in the network's order."""
+    """The parts that change while a network trains. average: that of the weights, in the network's order."""
 
     network: Lumen
     average: list[Tensor]
@@ -38,7 +38,7 @@ class Run:
     def advance(self, largest: float) -> Tensor:
         """Take the optimiser's step with gradients of a norm of at most `largest`, and count it.
 
-        Returns 1 where a gradient was not finite; then the weights move by momentum alone.
+        Returns 1 where a gradient was not finite. The weights then move by momentum alone.
         """
         for group in self.optimizer.param_groups:
             group["lr"] = self.rate * group["share"] * self.clock.rate
@@ -70,7 +70,7 @@ class Run:
 
     @torch.no_grad()
     def resume(self, out: Path) -> None:
-        """Take up what `store` wrote; without the state's files, the average. Raises InputError."""
+        """Load what `store` wrote or, without the state's files, the average. Raises InputError."""
         try:
             head = json.loads((out / INDEX).read_text())
             means, state = read_parts(out, AVERAGE), read_parts(out, STATE)
@@ -89,7 +89,7 @@ class Run:
 
 
 def make_optimizer(network: Lumen, rate: float, weight_decay: float) -> torch.optim.Optimizer:
-    """Return AdamW: matrices decay, biases and scales do not, and the backbone moves less."""
+    """Return AdamW. Matrices decay, biases and scales do not, and the backbone moves less."""
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
     for name, weight in network.named_parameters():
         share = BACKBONE_RATE if name.startswith("scene.backbone") else 1.0

@@ -22,13 +22,13 @@ from dior_rt.training.lumen.layers import Block, Down, Residual, Up, rotations
 from dior_rt.training.lumen.optics import decode_light, double, luminance, srgb_to_linear
 
 NORMAL, DEPTH, SKY, ALBEDO = 3, 1, 1, 3  # channels of the geometry head
-ORIENTATION = 4  # how brightness depends on the normal's three components, and a constant
+ORIENTATION = 4  # factors of the normal's three components and a constant on brightness
 BOUNCES = 2  # light that has bounced nearby, and anywhere
 COLOUR_RANGE = 1.2  # of the logarithm of a light colour's channels
 
 
 class Scene(NamedTuple):
-    """What a photo shows, for a batch of (B, ., H, W)."""
+    """The scene of a photo, for a batch of (B, ., H, W)."""
 
     light: Tensor  # (B, 3, H, W) the photo's own Lumi map, linear
     normal: Tensor  # (B, 3, H, W) unit vectors: x right, y up, z towards the camera
@@ -72,7 +72,7 @@ class SceneNetwork(nn.Module):
             self.light.bias[-BOUNCES:] = -2.0  # type: ignore[index]
 
     def forward(self, photo: Tensor) -> Scene:
-        """photo: (B, 3, H, W), sRGB in 0..1, H and W multiples of 8."""
+        """Return the scene. photo: (B, 3, H, W), sRGB in 0..1, H and W multiples of 8."""
         rows, columns = photo.shape[2] // PATCH, photo.shape[3] // PATCH
         seen4, seen8, seen16 = self.backbone(double(photo))  # strides 2, 4 and 8 of the photo
         linear = srgb_to_linear(photo)
@@ -97,7 +97,7 @@ class SceneNetwork(nn.Module):
         return Scene(light, normal, depth, sky, torch.sigmoid(albedo), bounce, fine, half, quarter, grid)
 
     def _light(self, half: Tensor, pooled: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """The light (B, 3, H, W), linear, and the shares of bounced light (B, 2, H, W)."""
+        """Return the light (B, 3, H, W), linear, and the shares of bounced light (B, 2, H, W)."""
         colours = self.config.colours
         maps = double(self.light(half).float())
         oriented, shares, bounce = maps.split((ORIENTATION, colours, BOUNCES), dim=1)
@@ -109,6 +109,6 @@ class SceneNetwork(nn.Module):
 
 
 def palette(raw: Tensor) -> Tensor:
-    """(B, K, 3) unbounded to colours of luminance 1."""
+    """Return colours of luminance 1 from (B, K, 3) unbounded values."""
     colour = torch.exp(COLOUR_RANGE * torch.tanh(raw))
     return colour / luminance(colour.transpose(1, 2)).transpose(1, 2)

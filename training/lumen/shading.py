@@ -1,11 +1,10 @@
-"""Turn a photo and two lights into the picture: the quotient of the lights, with what has bounced in both.
+"""Turn a photo and two lights into the picture: the quotient of the lights, with bounced light in both.
 
     relit = (photo + e) * exp(r) - e      r = log((T + B(T) + b) / (S + B(S) + b)) + factor
 
-S and T are the source and target Lumi maps, B(L) = near * blur(L) + far * mean(L) is the light that
-bounced, with the shares `near` and `far` that the scene network reads from the photo. Equal lights return
-the photo, bit for
-bit.
+S and T are the source and target Lumi maps, B(L) = near * blur(L) + far * mean(L) is the
+bounced light, with the shares `near` and `far` that the scene network reads from the photo. Equal lights
+return the photo, bit for bit.
 """
 
 from __future__ import annotations
@@ -16,26 +15,28 @@ from torch import Tensor
 from dior_rt.training.lumen.config import SIDE
 from dior_rt.training.lumen.optics import BOUNCED, FLOOR, blur, linear_to_srgb, srgb_to_linear
 
-NEARBY = 1 / 10  # of the grid's side: how far light bounces to its surroundings
+NEARBY = 1 / 10  # share of the grid's side over which light bounces
 
 
 def bounced(light: Tensor, bounce: Tensor) -> Tensor:
-    """Light (B, 3, H, W) with what has bounced; bounce: (B, 2, H, W)."""
+    """Return light (B, 3, H, W) with its bounced part. bounce: (B, 2, H, W)."""
     near, far = bounce[:, :1], bounce[:, 1:]
     return light + near * blur(light, NEARBY * SIDE) + far * light.mean(dim=(2, 3), keepdim=True) + BOUNCED
 
 
 def log_ratio(source: Tensor, target: Tensor, bounce: Tensor, factor: Tensor) -> Tensor:
-    """(B, 3, H, W): the logarithm of how much the picture's light changes."""
+    """Return (B, 3, H, W), the logarithm of the change of the picture's light."""
     return torch.log(bounced(target, bounce) / bounced(source, bounce)) + factor
 
 
 def relight(photo: Tensor, ratio: Tensor) -> Tensor:
-    """The relit picture, linear and not clipped, of a photo that is sRGB-encoded in 0..1."""
+    """Return the relit picture, linear and not clipped, of a photo that is sRGB-encoded in 0..1."""
     return (srgb_to_linear(photo) + FLOOR) * torch.exp(ratio.clamp(-6, 6)) - FLOOR
 
 
 def shown(linear: Tensor) -> Tensor:
-    """As the display shows it, with a little slope beyond its range so that training can come back."""
+    """Return the picture as the display shows it, with a small slope outside its range so that training can
+    return.
+    """
     inside = linear.clamp(0, 1)
     return linear_to_srgb(inside) + 0.05 * (linear - inside).clamp(-1, 1)

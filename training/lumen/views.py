@@ -1,4 +1,4 @@
-"""Rendered views as bytes on a device, and how light is put into bytes.
+"""Rendered views as bytes on a device, and the encoding of light in bytes.
 
 Light x of a source whose brightest value is m becomes round(255 log(1 + 400 x / m) / log 401): steps of 1.2
 to 2.4 %.
@@ -16,7 +16,7 @@ STRENGTH = 400.0
 
 
 def to_code(light: Tensor, most: Tensor) -> Tensor:
-    """Light 0..most to uint8."""
+    """Return light 0..most as uint8 codes."""
     code = torch.log1p(STRENGTH * (light / most).clamp(0, 1)) * (255 / math.log1p(STRENGTH))
     return code.round().to(torch.uint8)
 
@@ -34,13 +34,13 @@ class Views:
     lumi: Tensor  # (V, K, 3, H, W) uint8 codes of its Lumi map
     image_most: Tensor  # (V, K) float32, brightest value of each picture
     lumi_most: Tensor  # (V, K) float32
-    usable: Tensor  # (V, K) bool: a source that lights enough of the view
+    usable: Tensor  # (V, K) bool: whether a source lights enough of the view
     world: Tensor  # (V, K) bool: the source is the environment
     normal: Tensor  # (V, 3, H, W) uint8: 127.5 (n + 1), camera space, x right, y up, z towards the camera
     albedo: Tensor  # (V, 3, H, W) uint8, sRGB
     depth: Tensor  # (V, 1, H, W) uint8: logarithm of the distance along the view axis, see `depth_range`
     depth_range: Tensor  # (V, 2) float32: logarithm of the nearest and of the farthest distance
-    ids: Tensor  # (V, 1, H, W) uint8: which object; 255 is sky
+    ids: Tensor  # (V, 1, H, W) uint8: the object's number; 255 is sky
     slope: Tensor  # (V,) float32: tangent of half the angle of view
 
     def __len__(self) -> int:

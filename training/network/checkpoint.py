@@ -1,4 +1,4 @@
-"""The files of a checkpoint: what training writes and export reads."""
+"""Read and write the files of a checkpoint, which training writes and export reads."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def save_network(network: Mini, path: Path) -> None:
 
 
 def load_network(path: Path) -> Mini:
-    """Return the network of a file written by `save_network`; half-precision weights become float32.
+    """Return the network in a file written by `save_network`. Half-precision weights become float32.
 
-    Raises InputError for a file that is missing, cut short, or something else.
+    Raises InputError for a file that is missing, cut short, or of another kind.
     """
     check_readable(path, "checkpoint")
     try:

@@ -1,4 +1,4 @@
-"""The size of the network, and the number of channels of what it sees and answers."""
+"""The size of the network, and the numbers of its input and output channels."""
 
 from __future__ import annotations
 

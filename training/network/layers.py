@@ -25,7 +25,7 @@ POSITION_RANGE: Final = 100.0
 
 
 class MixNeighbours(nn.Module):
-    """`mix_neighbours` as a module, which a study can leave out."""
+    """`mix_neighbours` as a module, so that a study can leave it out."""
 
     def forward(self, cells: Tensor) -> Tensor:
         return mix_neighbours(cells)
@@ -55,7 +55,10 @@ class Divide(nn.Conv2d):
 
 
 class Refine(nn.Module):
-    """Add what the surroundings say to every cell's features: (B, C, h, w) to the same. Zero at first."""
+    """Add a function of the neighbourhood to every cell's features: (B, C, h, w) -> (B, C, h, w).
+
+    Zero at first.
+    """
 
     def __init__(self, size: int) -> None:
         super().__init__()
@@ -112,7 +115,7 @@ class Block(nn.Module):
 
 
 def layer_norm(tokens: Tensor) -> Tensor:
-    """Return the tokens with mean 0 and variance 1 each; nothing is learnt."""
+    """Return the tokens with mean 0 and variance 1 each. The norm has no trained parameters."""
     return F.layer_norm(tokens, tokens.shape[-1:])
 
 
@@ -134,7 +137,8 @@ def time_features(sigma: Tensor, width: int) -> Tensor:
 def rotations(rows: int, columns: int, size: int, device: torch.device) -> Rotation:
     """Return cosine and sine (rows * columns, size / 2) of the rotary position code (RoPE, arXiv 2104.09864).
 
-    Half of the angles depend on the row, half on the column. Nothing is learnt, so any shape of grid works.
+    Half of the angles depend on the row, half on the column. No parameter is trained, so any shape of grid
+    works.
     """
     quarter = size // 4
     frequency = torch.exp(-math.log(POSITION_RANGE) * torch.arange(quarter, device=device) / quarter)

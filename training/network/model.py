@@ -38,7 +38,7 @@ from dior_rt.training.network.layers import (
     time_features,
 )
 
-#: Gates are sigmoid(answer - CLOSED), so they begin an eighth open.
+#: Gates are sigmoid(answer - CLOSED), so their first value is about an eighth.
 CLOSED: Final = 2.0
 #: With noise 1 / HIDING_RATIO times as strong as the image, half of the state is hidden from the network.
 HIDING_RATIO: Final = 0.1
@@ -97,7 +97,7 @@ class Mini(nn.Module):
     ) -> Tensor | tuple[Tensor, Tensor]:
         """Return the velocity; with `with_source` also the encoded source Lumi map.
 
-        own: that map, if it is known from an earlier call.
+        own: that map, where an earlier call has estimated it.
         """
         own = self.estimate_source(photo) if own is None else own
         result = self.step(x, sigma, mode, *self.encode(photo, light, mask, own))
@@ -106,15 +106,15 @@ class Mini(nn.Module):
     def estimate_source(self, photo: Tensor) -> Tensor:
         """Return the encoded source Lumi map (B, 3, h, w), estimated without strokes from a state of zeros.
 
-        If the network saw the strokes, the estimate would lean towards them, because drawn light tends to be
-        like the light that is there; then twice the drawn light would be less than twice the light.
+        If the network saw the strokes, they would bias the estimate, because drawn light tends to resemble
+        the light that is there. Twice the drawn light would then be less than twice the light.
         """
         zeros, sigma = torch.zeros_like(photo), torch.ones_like(photo[:, 0, 0, 0])
         blank = self.encode(photo, zeros, zeros[:, :1], zeros)
         return self._answers(zeros, sigma, sigma.long(), blank)[1]
 
     def encode(self, photo: Tensor, light: Tensor, mask: Tensor, own: Tensor) -> Features:
-        """Compute the features that do not depend on flow time; own: the encoded source Lumi map."""
+        """Compute the features that do not depend on flow time. own: the encoded source Lumi map."""
         linear, patch = srgb_to_linear(photo), self.config.patch
         fine = F.silu(self.see(seen_channels(photo, light, mask, linear, patch)))  # (B, fine, h, w)
         half = F.silu(self.see_half(fine))  # (B, half, h / 2, w / 2)
@@ -147,7 +147,7 @@ class Mini(nn.Module):
         """Return x0 of relighting, and the encoded source Lumi map, (B, 3, h, w) each."""
         visible = state_visibility(sigma)
         state = x * visible[:, None, None, None]
-        time = 1 - (1 - sigma) * visible  # where the state is hidden, so is the flow time
+        time = 1 - (1 - sigma) * visible  # where the state is hidden, the flow time is hidden as well
         condition = F.silu(
             self.time(_twice(time_features(time, self.config.width))) + _twice(self.mode(mode))
         )  # (2 B, width)
@@ -166,13 +166,14 @@ class Mini(nn.Module):
     def _transform(self, features: Features, state: Tensor, condition: Tensor) -> Tensor:
         """Run the transformer and return features of 4 x 4 cells, (B, quarter, h / 4, w / 4).
 
-        condition: (2 B, width), of which the first half counts.
+        condition: (2 B, width); only the first half is used.
         """
         rotation = features.cosine.flatten(1, 2), features.sine.flatten(1, 2)  # (B, N, width / heads / 2)
         tokens = features.tokens + self.embed_state(state)  # (B, width, rows, columns)
         batch, _, rows, columns = tokens.shape
         tokens = tokens.flatten(2).transpose(1, 2)  # (B, N, width), N = rows * columns
-        # The vectors of all blocks at once, because six of them are too little work for one product.
+        # The vectors of all blocks are computed at once, because six of them are too little work for one
+        # product.
         start = torch.tensor([0.0, 1, 0, 0, 1, 0], device=tokens.device)[:, None]  # scales begin at 1
         offsets = torch.stack([block.get_parameter("offset") for block in self.blocks]) + start
         modulation = self.modulation(condition)[:batch].unflatten(1, (1, MODULATIONS, -1)) + offsets
@@ -194,17 +195,17 @@ class Mini(nn.Module):
 def velocity(x: Tensor, sigma: Tensor, expected: Tensor) -> Tensor:
     """Return E[eps - x0 | x] where x = (1 - sigma) x0 + sigma eps, and x0 is Gaussian about `expected`.
 
-    The result rests on `expected` near noise and on the state near the image, and no sigma is divided by.
+    The result depends on `expected` near noise and on the state near the image. It never divides by sigma.
     """
     rest, variance = 1 - sigma, DEVIATION**2
     return ((sigma - rest * variance) * x - sigma * expected) / (rest**2 * variance + sigma**2)
 
 
 def state_visibility(sigma: Tensor) -> Tensor:
-    """Return (B,) in 0..1: how much of the state the network sees.
+    """Return (B,) in 0..1: the share of the state that the network sees.
 
-    Near noise the state says nothing about the photo; it holds only a faint copy of the network's earlier
-    answers, and the network must not take these for evidence.
+    Near noise the state contains no information about the photo. It holds only a faint copy of the network's
+    earlier answers, and the network must not treat these as evidence.
     """
     image, noise = (1 - sigma) ** 2, (HIDING_RATIO * sigma) ** 2
     return image / (image + noise)
@@ -219,6 +220,8 @@ def relit_answer(photo: Tensor, linear: Tensor, ratio: Tensor) -> Tensor:
 
 
 def _twice(rows: Tensor) -> Tensor:
-    """Repeat the rows: a product of one row is summed in another order than one of several rows, so a single
-    picture would have other last bits than the same picture in a batch."""
+    """Repeat the rows. A product of one row is summed in another order than one of several rows.
+
+    Without the repetition, a single picture would differ in its last bits from the same picture in a batch.
+    """
     return torch.cat([rows, rows])

@@ -1,1 +1,1 @@
-"""Random scenes as plain data: shapes, textures, skies, and the builders that put them together."""
+"""Random scenes as plain data: shapes, textures, skies, and the builders that combine them."""

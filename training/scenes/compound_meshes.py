@@ -1,4 +1,4 @@
-"""More meshes: turned, extruded, swept, grown and joined things. About one unit in radius, y up."""
+"""Compound meshes: turned, extruded, swept, grown and joined. About one unit in radius, y up."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Points = NDArray[np.float64]
 
 
 def joined(parts: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one."""
+    """Return several meshes as one."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -29,12 +29,12 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def bar(half: Sequence[float], at: Sequence[float]) -> Mesh:
-    """A cuboid at a place."""
+    """Return a cuboid at a place."""
     return shapes.box(np.array(half)).placed(np.ones(3), 0.0, np.array(at))
 
 
 def turned(profile: Points, around: int = 40) -> Mesh:
-    """A profile (K, 2) of radius and height, from the top down, turned about y."""
+    """Return a profile (K, 2) of radius and height, from the top down, turned about y."""
     angle = np.linspace(0, 2 * np.pi, around + 1)[None, :]
     radius, height = profile[:, :1], profile[:, 1:]
     return shapes.lattice(
@@ -43,7 +43,7 @@ def turned(profile: Points, around: int = 40) -> Mesh:
 
 
 def vessel(rng: Generator) -> Mesh:
-    """A vase, a jug or a bowl: open above, its wall of some thickness."""
+    """Return a vase, a jug or a bowl: open above, with a wall of some thickness."""
     from scipy.interpolate import PchipInterpolator
 
     bowl = rng.uniform() < 0.4
@@ -58,7 +58,7 @@ def vessel(rng: Generator) -> Mesh:
 
 
 def column(rng: Generator) -> Mesh:
-    """A pillar two units high, smooth or fluted, on a plinth."""
+    """Return a pillar two units high, smooth or fluted, on a plinth."""
     flutes = int(rng.choice([0, 0, 12, 20]))
     angle = np.linspace(0, 2 * np.pi, 97)[None, :]
     height = np.linspace(0.9, -0.9, 13)[:, None]
@@ -70,12 +70,12 @@ def column(rng: Generator) -> Mesh:
 
 
 def extruded(rng: Generator) -> Mesh:
-    """A silhouette cut out of a board: a star, a gear, a flower or a blob, whose edges are sharp."""
+    """Return an extruded silhouette with sharp edges: a star, a gear, a flower or a blob."""
     angle = np.linspace(0, 2 * np.pi, 97)[:-1]
     teeth, depth = rng.integers(3, 12), rng.uniform(0.1, 0.5)
     kind = rng.integers(4)
     radius: NDArray[np.floating[Any]]
-    if kind == 0:  # straight lines between far and near points
+    if kind == 0:  # straight lines between distant and near points
         radius = 1 - depth * np.abs((angle * teeth / np.pi + 1) % 2 - 1)
     elif kind == 1:
         radius = 1 - 0.5 * depth * (np.sin(teeth * angle) > 0)
@@ -89,7 +89,9 @@ def extruded(rng: Generator) -> Mesh:
 
 
 def prism(outline: Points, half: float) -> Mesh:
-    """The outline (K, 2), star-shaped about 0, counter-clockwise in x and y, as a board 2 half thick in z."""
+    """Return the outline (K, 2), star-shaped about 0, counter-clockwise in x and y, as a board 2 half thick
+    in z.
+    """
     ring = np.concatenate([outline, outline[:1]])
     wall = np.stack([np.column_stack([ring, np.full(len(ring), z)]) for z in (half, -half)])
     sides = joined([shapes.lattice(wall[:, k : k + 2]) for k in range(len(outline))])
@@ -110,14 +112,14 @@ def prism(outline: Points, half: float) -> Mesh:
 
 
 def standing(mesh: Mesh, rng: Generator) -> Mesh:
-    """Upright, or laid flat."""
+    """Return the mesh upright, or laid flat."""
     if rng.uniform() < 0.6:
         return mesh
     return Mesh(mesh.vertices[:, [0, 2, 1]] * np.array([1, 1, -1], np.float32), mesh.uv, mesh.faces)
 
 
 def knot(rng: Generator) -> Mesh:
-    """A tube along a torus knot."""
+    """Return a tube along a torus knot."""
     p, q = ((2, 3), (3, 2), (2, 5), (1, 3))[rng.integers(4)]
     t = np.linspace(0, 2 * np.pi, 97)
     ring = 0.65 + 0.3 * np.cos(q * t)
@@ -126,7 +128,7 @@ def knot(rng: Generator) -> Mesh:
 
 
 def tube(path: Points, radius: float, around: int = 12) -> Mesh:
-    """A round tube along a path (K, 3) that is nowhere vertical for long."""
+    """Return a round tube along a path (K, 3) that has no long vertical stretch."""
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     side = np.cross(along, [0.05, 1.0, 0.02])
@@ -139,7 +141,7 @@ def tube(path: Points, radius: float, around: int = 12) -> Mesh:
 
 
 def plant(rng: Generator) -> Mesh:
-    """Leaves about a stem."""
+    """Return leaves about a stem."""
     count, wide, bend = rng.integers(8, 30), rng.uniform(0.08, 0.3), rng.uniform(0.1, 0.9)
     stem = rng.uniform(0.0, 1.2)
     leaves = [_leaf(rng, wide, bend) for _ in range(count)]
@@ -154,7 +156,7 @@ def plant(rng: Generator) -> Mesh:
 
 
 def _leaf(rng: Generator, wide: float, bend: float) -> Mesh:
-    """A leaf from the origin along +x: folded along its middle, hanging at its end."""
+    """Return a leaf from the origin along +x, folded along its middle, with a drooping end."""
     t, s = np.meshgrid(np.linspace(0, 1, 11), np.linspace(-1, 1, 5), indexing="ij")
     rise = rng.uniform(0.2, 1.4)
     x = t * np.cos(rise)
@@ -164,7 +166,7 @@ def _leaf(rng: Generator, wide: float, bend: float) -> Mesh:
 
 
 def cloth(rng: Generator) -> Mesh:
-    """A cloth over a round or square table one unit in radius and high, in folds beyond its edge."""
+    """Return a cloth over a round or square table one unit in radius and height, in folds beyond its edge."""
     x, z = np.meshgrid(np.linspace(-1.5, 1.5, 49), np.linspace(-1.5, 1.5, 49), indexing="ij")
     power = 2.0 if rng.uniform() < 0.5 else 8.0
     reach = (np.abs(x) ** power + np.abs(z) ** power) ** (1 / power)
@@ -180,7 +182,7 @@ def cloth(rng: Generator) -> Mesh:
 
 
 def curtain(rng: Generator) -> Mesh:
-    """A hanging cloth, two units wide and high, in folds."""
+    """Return a hanging cloth, two units wide and high, in folds."""
     x, y = np.meshgrid(np.linspace(-1, 1, 129), np.linspace(1, -1, 17))
     phase = rng.integers(4, 12) * np.pi * (x + 0.05 * np.sin(7 * x)) + 0.3 * y
     z = 0.12 * np.sin(phase) * (0.7 - 0.3 * y) + 0.05 * np.sin(2.3 * phase + 1)
@@ -188,13 +190,13 @@ def curtain(rng: Generator) -> Mesh:
 
 
 def rock(rng: Generator) -> Mesh:
-    """A stone: a ball pushed about by noise, coarse and fine."""
+    """Return a stone: a ball deformed by coarse and fine noise."""
     ball = shapes.superquadric(rng.uniform(0.6, 1.2), rng.uniform(0.6, 1.2))
     return shapes.bumpy(shapes.bumpy(ball, rng, rng.uniform(0.4, 0.9)), rng, rng.uniform(0.2, 0.5))
 
 
 def table(rng: Generator) -> Mesh:
-    """A table whose top is at 1 and reaches to 1 in x."""
+    """Return a table whose top is at height 1 and reaches to 1 in x."""
     deep, leg = rng.uniform(0.5, 0.9), rng.uniform(0.03, 0.08)
     legs = [
         bar([leg, 0.48, leg], [sx * (1 - leg), 0.48, sz * (deep - leg)]) for sx in (-1, 1) for sz in (-1, 1)
@@ -203,7 +205,7 @@ def table(rng: Generator) -> Mesh:
 
 
 def chair(rng: Generator) -> Mesh:
-    """A chair two units high, its seat at 0.95, its back of bars."""
+    """Return a chair two units high, with its seat at 0.95 and a back of bars."""
     wide, leg = rng.uniform(0.42, 0.55), rng.uniform(0.03, 0.06)
     parts = [bar([wide, 0.04, wide], [0, 0.92, 0])]
     parts += [
@@ -223,7 +225,7 @@ def chair(rng: Generator) -> Mesh:
 
 
 def shelf(rng: Generator) -> Mesh:
-    """A case two units high and wide, open to +z, its boards at the heights `shelf_heights` gives."""
+    """Return a case two units high and wide, open to +z, with boards at the heights of `shelf_heights`."""
     boards = [bar([1.0, 0.025, 0.25], [0, y, 0]) for y in np.linspace(0.03, 1.97, rng.integers(3, 6))]
     sides = [bar([0.025, 1.0, 0.25], [x, 1.0, 0]) for x in (-0.98, 0.98)]
     back = [bar([1.0, 1.0, 0.01], [0, 1.0, -0.24])] if rng.uniform() < 0.6 else []
@@ -231,7 +233,7 @@ def shelf(rng: Generator) -> Mesh:
 
 
 def screen(rng: Generator) -> Mesh:
-    """Bars or blinds, two units wide and high, in the plane z = 0: light falls through in stripes."""
+    """Return bars or blinds, two units wide and high, in the plane z = 0. Light falls through in stripes."""
     count, thick = int(rng.integers(5, 14)), rng.uniform(0.15, 0.55)
     step = 2 / count
     places = -1 + step * (np.arange(count) + 0.5)

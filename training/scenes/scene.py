@@ -1,4 +1,4 @@
-"""Random scenes as plain data, drawn from a seed: things, cameras, and the sources that light them."""
+"""Random scenes as plain data, drawn from a seed: objects, cameras, and the sources that light them."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ from dior_rt.training.scenes.textures import texture
 
 Vector = NDArray[np.float64]
 KINDS = ("subject", "objects", "interior")
-SOURCES = 4  # local sources a scene; the dome comes on top
+SOURCES = 4  # local sources per scene, besides the dome
 
 
 @dataclass(frozen=True)
 class Material:
-    """finish: how the reflectance (T, T, 3) is coated. roughness: of the coat, 0 mirror .. 1 matte.
+    """The material of a surface.
 
-    relief: heights (T, T) of a bumped surface, in units; their slopes tilt normals, those of Lumi maps too.
+    finish: the coating of the reflectance (T, T, 3). roughness: 0 mirror .. 1 matte.
+
+    relief: heights (T, T) of a bumped surface, in units. Their slopes tilt the normals, also those of Lumi
+    maps.
     """
 
     finish: Literal["matte", "plastic", "metal"]
@@ -41,10 +44,13 @@ class Thing:
 
 @dataclass(frozen=True)
 class Source:
-    """One light of radiance 1; a spot is a point of intensity 1. `target`: what panel and spot face.
+    """One light of radiance 1; a spot is a point of intensity 1.
+
+    `target`: the point that panel and spot face.
 
     size: a sphere's radius; half a square panel's side; a spot's half angle in degrees. A dome shines from
-    everywhere and has neither place nor size; nor has a sky, whose radiance is its panorama (H, 2H, 3).
+    everywhere and has neither place nor size. The same holds for a sky, whose radiance is its panorama (H,
+    2H, 3).
     """
 
     kind: Literal["sphere", "panel", "spot", "dome", "sky"]
@@ -58,10 +64,12 @@ class Source:
 class Camera:
     at: Vector
     target: Vector
-    fov: float  # degrees, both ways: pictures are square
+    fov: float  # degrees, in both directions: pictures are square
 
     def sees(self, point: Vector, radius: float) -> bool:
-        """Whether any of a ball lies inside the viewing pyramid (a cone about it, to be safe)."""
+        """Return whether any part of a ball lies inside the viewing pyramid (conservatively, a cone about
+        it).
+        """
         axis = (self.target - self.at) / np.linalg.norm(self.target - self.at)
         away = point - self.at
         distance = float(np.linalg.norm(away))
@@ -81,7 +89,9 @@ class Scene:
 
 
 def scene(seed: int, cameras: int = 2) -> Scene:
-    """The scene of that seed, about 4 units across: a subject alone, interacting objects, or an interior."""
+    """Return the scene of a seed, about 4 units across: a single subject, interacting objects, or an
+    interior.
+    """
     rng = np.random.default_rng(seed)
     kind = KINDS[rng.choice(3, p=[0.25, 0.45, 0.3])]
     builders = {"subject": _subject, "objects": _objects, "interior": _interior}
@@ -105,7 +115,7 @@ def _slab(size: tuple[float, float, float], at: tuple[float, float, float], mate
 
 
 def _surroundings(rng: Generator) -> list[Thing]:
-    """Ground, and a backdrop on three sides, so that no view ends in nothing."""
+    """Return ground, and a backdrop on three sides, so that every view ends at a surface."""
     floor = _matte(rng) if rng.uniform() < 0.7 else _material(rng)
     if rng.uniform() < 0.25:
         ground = Thing(shapes.terrain(rng, 7.0, rng.uniform(0.1, 0.6)), floor)
@@ -124,14 +134,14 @@ def _surroundings(rng: Generator) -> list[Thing]:
 def _stand(
     mesh: Mesh, scale: Vector, turn: float, x: float, z: float, floor: float, material: Material
 ) -> Thing:
-    """The mesh with its lowest point on the floor."""
+    """Return the mesh with its lowest point on the floor."""
     placed = mesh.placed(scale, turn, np.array([x, 0.0, z]))
     lowest = float(placed.vertices[:, 1].min())
     return Thing(placed.placed(np.ones(3), 0.0, np.array([0.0, floor - lowest, 0.0])), material)
 
 
 def _subject(rng: Generator) -> list[Thing]:
-    """One figure: a body, most often with a head on it."""
+    """Return one figure: a body, usually with a head on it."""
     body = _stand(
         shapes.random_shape(rng),
         rng.uniform(0.5, 1.0, 3),
@@ -152,7 +162,7 @@ def _subject(rng: Generator) -> list[Thing]:
 
 
 def _objects(rng: Generator) -> list[Thing]:
-    """Three to eight things close enough to shade and touch each other; some stand on others."""
+    """Return three to eight objects that shade and touch each other; some stand on others."""
     things = _surroundings(rng)
     for _ in range(rng.integers(3, 9)):
         scale = rng.uniform(0.2, 0.75) * rng.uniform(0.6, 1.5, 3)
@@ -165,7 +175,7 @@ def _objects(rng: Generator) -> list[Thing]:
 
 
 def _interior(rng: Generator) -> list[Thing]:
-    """A room open towards the camera, with furniture of boxes and things on it."""
+    """Return a room open towards the camera, with furniture of boxes and objects on it."""
     half, height, back = rng.uniform(1.6, 2.6), rng.uniform(2.2, 3.2), rng.uniform(1.2, 2.5)
     wall, middle = _matte(rng), height / 2
     things = [
@@ -184,7 +194,7 @@ def _interior(rng: Generator) -> list[Thing]:
 
 
 def _furniture(rng: Generator, half: float, back: float) -> list[Thing]:
-    """A block, most often with something on it."""
+    """Return a block, usually with an object on it."""
     size = rng.uniform(0.15, 0.7, 3) * np.array([1, 0.8, 0.8])
     x, z = rng.uniform(-half + size[0], half - size[0]), rng.uniform(-back + size[2], 0.8)
     block = _stand(shapes.box(size), np.ones(3), rng.choice([0.0, 0.0, 0.5]), x, z, 0.0, _material(rng))
@@ -199,7 +209,9 @@ def _furniture(rng: Generator, half: float, back: float) -> list[Thing]:
 
 
 def direction(around: float, up: float) -> Vector:
-    """The unit vector at two angles: around the vertical, from +z towards +x, and up from the ground."""
+    """Return the unit vector of two angles: around the vertical, from +z towards +x, and up from the
+    ground.
+    """
     return np.array([np.sin(around) * np.cos(up), np.sin(up), np.cos(around) * np.cos(up)])
 
 
@@ -215,13 +227,13 @@ def _camera(rng: Generator, kind: str) -> Camera:
 
 
 def _sources(rng: Generator, kind: str, cameras: tuple[Camera, ...]) -> list[Source]:
-    """Local sources that no camera sees, and the dome."""
+    """Return local sources that no camera sees, and the dome."""
     drawn = (_source(rng, kind) for _ in count())
     return [*islice(unseen(drawn, cameras), SOURCES), Source("dome", np.zeros(3), np.zeros(3), 0.0)]
 
 
 def unseen(sources: Iterator[Source], cameras: tuple[Camera, ...]) -> Iterator[Source]:
-    """Those that lie outside of every camera's view."""
+    """Yield the sources that lie outside every camera's view."""
     for source in sources:
         radius = (
             0.0 if source.kind == "spot" else source.size * (np.sqrt(2) if source.kind == "panel" else 1.0)

@@ -28,7 +28,7 @@ class Mesh:
     faces: NDArray[np.uint32]
 
     def placed(self, scale: NDArray[np.float64], turn: float, at: NDArray[np.float64]) -> Mesh:
-        """Scaled per axis, turned by an angle (radians) about y, moved."""
+        """Return the mesh scaled per axis, turned by an angle (radians) about y, and moved."""
         c, s = np.cos(turn), np.sin(turn)
         rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
         moved = (self.vertices * scale) @ rotation.T + at
@@ -36,7 +36,7 @@ class Mesh:
 
 
 def lattice(position: NDArray[np.float64]) -> Mesh:
-    """A mesh of positions (rows, columns, 3), which run around to the right and along downwards."""
+    """Return a mesh of positions (rows, columns, 3), which run around to the right and along downwards."""
     rows, columns = position.shape[:2]
     v, u = np.mgrid[:rows, :columns]
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
@@ -49,14 +49,14 @@ def lattice(position: NDArray[np.float64]) -> Mesh:
 
 
 def _without_slivers(mesh: Mesh) -> Mesh:
-    """Triangles that collapse at the poles have no normal; drop them."""
+    """Drop the triangles that collapse at the poles, because they have no normal."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     return Mesh(mesh.vertices, mesh.uv, mesh.faces[area > 1e-10])
 
 
 def box(half: NDArray[np.float64]) -> Mesh:
-    """A cuboid of the given half sides, centred: sharp edges, and a texture that repeats every 2 units."""
+    """Return a cuboid of half sides, centred, with sharp edges and a texture that repeats every 2 units."""
     vertices: list[NDArray[np.float64]] = []
     uv: list[NDArray[np.float64]] = []
     faces: list[NDArray[np.int64]] = []
@@ -85,7 +85,9 @@ def _angles() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def superquadric(roundness_along: float, roundness_around: float) -> Mesh:
-    """(Barr 1981) 1, 1 is a sphere; towards 0 the profile becomes a box."""
+    """Return a superquadric (Barr 1981): exponents 1, 1 give a sphere; towards 0 the profile becomes a
+    box.
+    """
     around, along = _angles()
 
     def power(x: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:
@@ -99,7 +101,7 @@ def superquadric(roundness_along: float, roundness_around: float) -> Mesh:
 
 
 def lathe(rng: Generator) -> Mesh:
-    """A turned profile: vase, bottle, bowl, pawn."""
+    """Return a turned profile: vase, bottle, bowl, pawn."""
     around, along = _angles()
     height = (along[:, 0] + np.pi / 2) / np.pi
     knots = np.concatenate(
@@ -114,7 +116,7 @@ def lathe(rng: Generator) -> Mesh:
 
 
 def torus(thickness: float) -> Mesh:
-    """A ring that lies flat; thickness is the tube's radius over the ring's, below 1."""
+    """Return a ring that lies flat. thickness: the tube's radius over the ring's, below 1."""
     around, _ = _angles()
     tube = np.linspace(0, 2 * np.pi, ALONG + 1)[:, None]
     ring = (1 + thickness * np.cos(tube)) / (1 + thickness)
@@ -123,7 +125,7 @@ def torus(thickness: float) -> Mesh:
 
 
 def bumpy(mesh: Mesh, rng: Generator, depth: float) -> Mesh:
-    """The mesh pushed along its radius by smooth noise of the given depth; the poles stay closed."""
+    """Return the mesh displaced along its radius by smooth noise of that depth. The poles stay closed."""
     field = noise(rng, size=AROUND, octaves=3, start=2)
     column = np.minimum((mesh.uv[:, 0] * AROUND).round().astype(int) % AROUND, AROUND - 1)
     row = np.minimum((mesh.uv[:, 1] * (AROUND - 1)).round().astype(int), AROUND - 1)
@@ -133,14 +135,14 @@ def bumpy(mesh: Mesh, rng: Generator, depth: float) -> Mesh:
 
 
 def terrain(rng: Generator, half: float, depth: float) -> Mesh:
-    """Uneven ground of the given half width around the origin, y up, its height within the depth."""
+    """Return uneven ground of that half width around the origin, y up, with heights within the depth."""
     field = np.pad(noise(rng, size=64, octaves=4), ((0, 1), (0, 1)), mode="wrap")
     z, x = np.mgrid[-half:half:65j, -half:half:65j]
     return lattice(np.stack([x, depth * (field - 0.5), z], axis=-1))
 
 
 def random_shape(rng: Generator) -> Mesh:
-    """Any of the shapes, a third of them bumpy."""
+    """Return one of the shapes at random. A third of them are bumpy."""
     kind = rng.choice(4, p=[0.2, 0.4, 0.3, 0.1])
     if kind == 0:
         mesh = superquadric(1, 1)

@@ -1,4 +1,4 @@
-"""Environment light: procedural panoramas of radiance, drawn from a seed. Linear, of mean 1.
+"""Environment light: procedural panoramas of linear radiance, drawn from a seed, with a mean of 1.
 
 A panorama (H, 2H, 3) is equirectangular as Mitsuba's `envmap` has it: rows from the zenith, y up, to the
 nadir, columns once around, from -z over +x to +z in the middle, and back over -x.
@@ -21,7 +21,7 @@ DUSK = np.array([1.0, 0.55, 0.25])
 
 
 def rays(rows: int = ROWS) -> Rays:
-    """(rows, 2 rows, 3) the unit vectors to a panorama's pixels."""
+    """Return (rows, 2 rows, 3), the unit vectors to a panorama's pixels."""
     down = (np.arange(rows) + 0.5) / rows * np.pi
     around = (np.arange(2 * rows) + 0.5) / rows * np.pi
     theta, phi = np.meshgrid(down, around, indexing="ij")
@@ -29,7 +29,7 @@ def rays(rows: int = ROWS) -> Rays:
 
 
 def panorama(rng: Generator) -> Raster:
-    """A clear or clouded sky with the sun, an overcast one, or a room with windows and lamps."""
+    """Return a clear or clouded sky with the sun, an overcast sky, or a room with windows and lamps."""
     kind = rng.choice(4, p=[0.3, 0.2, 0.15, 0.35])
     if kind == 3:
         light = _room(rng)
@@ -41,24 +41,26 @@ def panorama(rng: Generator) -> Raster:
 
 
 def _exposed(light: Rays) -> Raster:
-    """Scaled to a mean of 1 over the sphere."""
+    """Return the panorama scaled to a mean of 1 over the sphere."""
     weight = np.sqrt(1 - rays(len(light))[..., 1:2] ** 2)
     return (light / ((light * weight).sum() / (3 * weight.sum()))).astype(np.float32)
 
 
 def _over_ground(rng: Generator, sky: Rays) -> Rays:
-    """The sky, and below the horizon a ground that sends a part of it back."""
+    """Return the sky with a ground below the horizon that reflects a part of its light."""
     up = rays()[..., 1:2]
     ground = rng.uniform(0.05, 0.3) * sky[: ROWS // 2].mean(axis=(0, 1)) * rng.uniform(0.8, 1.2, 3)
     return np.where(up > 0, sky, ground)
 
 
 def _sunny(rng: Generator, clouds: float) -> Rays:
-    """Blue from horizon to zenith, red about a low sun, and the sun: a disc some degrees wide."""
+    """Return a sky blue from horizon to zenith, red about a low sun, with the sun as a disc some degrees
+    wide.
+    """
     towards = rays()
     up = np.clip(towards[..., 1:2], 0, 1)
     height = np.radians(rng.uniform(4, 70))
-    # Behind the scene's backdrop, at -z, a sun would light nothing.
+    # A sun behind the scene's backdrop, at -z, would light nothing.
     around = rng.uniform(-0.65, 0.65) * np.pi
     sun = np.array([np.sin(around) * np.cos(height), np.sin(height), np.cos(around) * np.cos(height)])
     warmth = np.exp(-np.degrees(height) / 12)
@@ -71,7 +73,7 @@ def _sunny(rng: Generator, clouds: float) -> Rays:
         sky = sky * (1 - cover) + cover * rng.uniform(0.6, 1.6)
     radius = np.radians(rng.uniform(1.5, 7))
     disc = 1 / (1 + np.exp((np.arccos(near) - radius) / 0.02))
-    share = rng.uniform(0.5, 4) * (1 - 0.6 * clouds)  # of the sun's light to the sky's
+    share = rng.uniform(0.5, 4) * (1 - 0.6 * clouds)  # ratio of the sun's light to the sky's
     color = (1 - warmth) * np.array([1.0, 0.95, 0.88]) + warmth * np.array([1.0, 0.6, 0.3])
     solid = np.sqrt(1 - towards[..., 1:2] ** 2)
     strength = share * (sky * solid)[: ROWS // 2].mean(axis=-1).sum() / max(float((disc * solid).sum()), 1e-6)
@@ -79,14 +81,16 @@ def _sunny(rng: Generator, clouds: float) -> Rays:
 
 
 def _overcast(rng: Generator) -> Rays:
-    """The zenith three times as bright as the horizon (Moon and Spencer 1942), in grey clouds."""
+    """Return a sky three times as bright at the zenith as at the horizon (Moon and Spencer 1942), in grey
+    clouds.
+    """
     up = np.clip(rays()[..., 1:2], 0, 1)
     clouds = 1 + rng.uniform(0, 1.2) * (_clouds(rng)[..., None] - 0.5)
     return _over_ground(rng, (1 + 2 * up) / 3 * clouds * (HAZE + rng.uniform(-0.08, 0.08, 3)))
 
 
 def _clouds(rng: Generator) -> NDArray[np.float64]:
-    """(ROWS, 2 ROWS) noise on a plane overhead, which closes to haze at the horizon."""
+    """Return (ROWS, 2 ROWS) noise on a plane overhead, which turns to haze at the horizon."""
     towards = rays()
     field = noise(rng, 128, octaves=5, start=3)
     plane = towards[..., [0, 2]] / np.maximum(towards[..., 1:2], 0.12) * 0.25
@@ -96,7 +100,7 @@ def _clouds(rng: Generator) -> NDArray[np.float64]:
 
 
 def _room(rng: Generator) -> Rays:
-    """A dim box about the scene, with windows in its walls and lamps in its ceiling."""
+    """Return a dim box about the scene, with windows in its walls and lamps in its ceiling."""
     towards = rays()
     half = rng.uniform([2, 1.2, 2], [4, 2, 4])
     reach = half / np.maximum(np.abs(towards), 1e-9)
@@ -111,7 +115,9 @@ def _room(rng: Generator) -> Rays:
 
 
 def _opening(rng: Generator, half: Rays, wall: NDArray[np.int64], at: Rays) -> Rays:
-    """A window, with a cross of bars or without, or a lamp in the ceiling: its light on the panorama."""
+    """Return the light on the panorama of a window, with or without a cross of bars, or of a lamp in the
+    ceiling.
+    """
     axis = int(rng.choice([0, 1, 2], p=[0.4, 0.3, 0.3]))
     sign = 1 if axis else rng.choice([-1, 1])  # none behind the backdrop, at -z
     u, v = (k for k in range(3) if k != axis)

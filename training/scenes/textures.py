@@ -1,4 +1,4 @@
-"""Procedural textures: small RGB rasters of reflectance, drawn from a seed. Linear, in [0.02, 0.9]."""
+"""Procedural textures: small linear RGB rasters of reflectance in [0.02, 0.9], drawn from a seed."""
 
 from __future__ import annotations
 
@@ -12,19 +12,21 @@ SIZE = 128
 
 
 def rainbow(hue: float) -> NDArray[np.float64]:
-    """The fully saturated RGB of a hue in 0..1: HSV's, of saturation and value 1."""
+    """Return the fully saturated RGB of a hue in 0..1: HSV with saturation and value 1."""
     return np.clip(np.abs((hue * 6 + np.array([0, 4, 2])) % 6 - 3) - 1, 0, 1)
 
 
 def color(rng: Generator) -> Raster:
-    """One reflectance (3,): any hue, a saturation mostly low as in paint, the values of real surfaces."""
+    """Return one reflectance (3,): any hue, mostly low saturation as in paint, and the values of real
+    surfaces.
+    """
     hue, saturation, value = rng.uniform(), rng.beta(1.2, 2.0), rng.uniform(0.05, 0.85)
     ramp = rainbow(hue)
     return np.clip(value * (1 - saturation * (1 - ramp)), 0.02, 0.9).astype(np.float32)
 
 
 def noise(rng: Generator, size: int = SIZE, octaves: int = 5, start: int = 3) -> Raster:
-    """(size, size) fractal value noise that tiles, in [0, 1]."""
+    """Return (size, size) fractal value noise that tiles, in [0, 1]."""
     total = np.zeros((size, size))
     for octave in range(octaves):
         cells = start * 2**octave
@@ -37,7 +39,7 @@ def noise(rng: Generator, size: int = SIZE, octaves: int = 5, start: int = 3) ->
 
 
 def _smooth_upsample(lattice: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """Periodic interpolation with the smoothstep weight 3t^2 - 2t^3."""
+    """Return a periodic interpolation with the smoothstep weight 3t^2 - 2t^3."""
     cells = lattice.shape[0]
     at = np.arange(size) * cells / size
     low = at.astype(int)
@@ -48,7 +50,7 @@ def _smooth_upsample(lattice: NDArray[np.float64], size: int) -> NDArray[np.floa
 
 
 def texture(rng: Generator) -> Raster:
-    """(SIZE, SIZE, 3) reflectance of one material: two colours in a pattern, and a little grain."""
+    """Return (SIZE, SIZE, 3) reflectance of one material: two colours in a pattern, and a little grain."""
     patterns = (_plain, _mottled, _checks, _stripes, _dots, _bricks, _veins)
     pattern = patterns[rng.choice(len(patterns), p=[0.3, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1])](rng)
     two = np.stack([color(rng), color(rng)])
@@ -105,7 +107,9 @@ def _veins(rng: Generator) -> Raster:
 
 
 def fine_texture(rng: Generator) -> Raster:
-    """(2 SIZE, 2 SIZE, 3) reflectance with detail down to texels: weave, grain, wood, pebbles, print."""
+    """Return (2 SIZE, 2 SIZE, 3) reflectance with detail down to texels: weave, grain, wood, pebbles,
+    print.
+    """
     patterns = (_weave, _speckles, _wood, _cells, _print, _fine_stripes)
     pattern = patterns[rng.integers(len(patterns))](rng)
     two = np.stack([color(rng), color(rng)])
@@ -114,7 +118,7 @@ def fine_texture(rng: Generator) -> Raster:
 
 
 def relief(rng: Generator) -> Raster:
-    """(2 SIZE, 2 SIZE) heights of a bumped surface, in 0..1: dents, grain, pebbles, weave or ribs."""
+    """Return (2 SIZE, 2 SIZE) heights of a bumped surface, in 0..1: dents, grain, pebbles, weave or ribs."""
     patterns = (_dents, _grain, _cells, _weave, _ribs)
     return patterns[rng.integers(len(patterns))](rng)
 
@@ -162,7 +166,7 @@ def _wood(rng: Generator) -> Raster:
 
 
 def _cells(rng: Generator) -> Raster:
-    """The distance to the nearest of many points, which tile (Worley 1996)."""
+    """Return the distance to the nearest of many points, which tile (Worley 1996)."""
     from scipy.spatial import cKDTree
 
     points = rng.uniform(size=(rng.integers(40, 600), 2))
@@ -171,7 +175,7 @@ def _cells(rng: Generator) -> Raster:
 
 
 def _print(rng: Generator) -> Raster:
-    """Lines of blocks like words on a page."""
+    """Return lines of blocks that resemble words on a page."""
     line, size = int(rng.integers(4, 12)), 2 * SIZE
     rows = np.repeat(rng.uniform(size=(size // line + 1, size // 2)) < 0.6, line, axis=0)[:size]
     ink = np.repeat(rows, 2, axis=1)

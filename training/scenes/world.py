@@ -1,8 +1,8 @@
-"""Scenes of greater variety, as plain data from a seed: meshes of many makes, bumped, glossy and metallic
-surfaces, fine textures, rooms with things that stand in the light's way, and panoramas for environment light.
+"""Scenes of greater variety, as plain data from a seed: meshes of many kinds, bumped, glossy and metallic
+surfaces, fine textures, rooms with objects that block the light, and panoramas for environment light.
 
-Their number means other scenes than `scenes.scene` has. Sources are candidates: of more than are needed, the
-renderer takes the first that light the view.
+The same seed gives another scene here than in `scenes.scene`. Sources are candidates: where there are more
+than the renderer needs, it takes the first that light the view.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ONE: Final = np.ones(3)
 
 
 def world(seed: int, cameras: int = 2) -> Scene:
-    """The scene of that seed, about 4 units across: a still life, a yard, or a room."""
+    """Return the scene of a seed, about 4 units across: a still life, a yard, or a room."""
     rng = np.random.default_rng([seed, 11])
     kind = ("still", "yard", "room")[rng.choice(3, p=[0.35, 0.25, 0.4])]
     builders = {"still": _still, "yard": _yard, "room": _room}
@@ -40,7 +40,9 @@ def world(seed: int, cameras: int = 2) -> Scene:
 
 
 def _material(rng: Generator, matte: float = 0.4) -> Material:
-    """Matte with that probability, else glossy or metallic; often finely textured or bumped."""
+    """Return a material: matte with that probability, else glossy or metallic; often finely textured or
+    bumped.
+    """
     bumps = _relief(rng) if rng.uniform() < 0.4 else None
     reflectance = fine_texture(rng) if rng.uniform() < 0.5 else texture(rng)
     if rng.uniform() < matte:
@@ -61,7 +63,7 @@ def _relief(rng: Generator) -> NDArray[np.float32]:
 
 
 def _paint(rng: Generator) -> Material:
-    """For walls and the like: mostly matte."""
+    """Return a paint for walls and similar surfaces: mostly matte."""
     return _material(rng, matte=0.85)
 
 
@@ -80,7 +82,7 @@ def _bar(half: tuple[float, float, float], at: tuple[float, float, float], mater
 def _stand(
     rng: Generator, mesh: Mesh, size: float, x: float, z: float, floor: float, paint: Material
 ) -> Thing:
-    """The mesh, scaled to about `size`, turned, with its lowest point on the floor."""
+    """Return the mesh, scaled to about `size`, turned, with its lowest point on the floor."""
     scale = size * (rng.uniform(0.85, 1.15, 3) if rng.uniform() < 0.5 else ONE)
     placed = mesh.placed(scale, rng.uniform(0, 6.28), np.array([x, 0.0, z]))
     low = float(placed.vertices[:, 1].min())
@@ -88,7 +90,7 @@ def _stand(
 
 
 def _small(rng: Generator) -> Mesh:
-    """Anything that may stand on a table."""
+    """Return any object that may stand on a table."""
     kind = rng.choice(5, p=[0.3, 0.2, 0.1, 0.15, 0.25])
     makers = (
         compound_meshes.vessel,
@@ -101,14 +103,14 @@ def _small(rng: Generator) -> Mesh:
 
 
 def _potted(rng: Generator, size: float, x: float, z: float, floor: float) -> list[Thing]:
-    """A plant in a pot."""
+    """Return a plant in a pot."""
     pot = _stand(rng, compound_meshes.vessel(rng), 0.35 * size, x, z, floor, _material(rng))
     top = float(pot.mesh.vertices[:, 1].max())
     return [pot, _stand(rng, compound_meshes.plant(rng), size, x, z, top - 0.1 * size, _leafy(rng))]
 
 
 def _spread(rng: Generator, count: int, half: tuple[float, float], apart: float) -> list[Vector]:
-    """Up to `count` places within half widths of 0, no two closer than `apart`."""
+    """Return up to `count` places within half widths of 0, no two closer than `apart`."""
     places: list[Vector] = []
     for _ in range(20 * count):
         place = rng.uniform([-half[0], -half[1]], half)
@@ -118,7 +120,7 @@ def _spread(rng: Generator, count: int, half: tuple[float, float], apart: float)
 
 
 def _backdrop(rng: Generator) -> list[Thing]:
-    """A bowed wall or a hanging behind the scene, as wide as the cameras see; the sides stay open."""
+    """Return a bowed wall or a hanging behind the scene, as wide as the cameras see. The sides stay open."""
     distance = rng.uniform(3, 7)
     arc = np.linspace(-1.25, 1.25, 33)
     outline = np.stack([np.sin(arc), -np.cos(arc)], axis=1) * distance
@@ -130,7 +132,7 @@ def _backdrop(rng: Generator) -> list[Thing]:
 
 
 def _still(rng: Generator) -> list[Thing]:
-    """Things close together on a table top or the ground, often on a cloth, before a backdrop."""
+    """Return objects close together on a table top or the ground, often on a cloth, before a backdrop."""
     things = [_bar((6, 0.1, 6), (0, -0.1, 0), _material(rng, 0.6)), *_backdrop(rng)]
     floor = 0.0
     if rng.uniform() < 0.4:
@@ -150,7 +152,7 @@ def _still(rng: Generator) -> list[Thing]:
 
 
 def _yard(rng: Generator) -> list[Thing]:
-    """Open ground with plants, stones, pillars, a chair, a screen: things that throw long shadows."""
+    """Return open ground with plants, stones, pillars, a chair, a screen: objects that cast long shadows."""
     ground = shapes.terrain(rng, 7.0, rng.uniform(0.05, 0.5)) if rng.uniform() < 0.6 else None
     flat = compound_meshes.bar((7, 0.1, 7), (0, -0.1, 0))
     things = [Thing(ground or flat, _material(rng, 0.8)), *_backdrop(rng)]
@@ -182,7 +184,9 @@ def _yard(rng: Generator) -> list[Thing]:
 
 
 def _room(rng: Generator) -> list[Thing]:
-    """Walls with a window on one side, which may have blinds; furniture, shelves, pillars, curtains."""
+    """Return walls with a window on one side, which may have blinds; furniture, shelves, pillars,
+    curtains.
+    """
     half, height, back = rng.uniform(1.7, 2.6), rng.uniform(2.2, 3.0), rng.uniform(1.4, 2.6)
     deep = back + 4.6
     middle = (4.6 - back) / 2
@@ -213,7 +217,7 @@ def _room(rng: Generator) -> list[Thing]:
 
 
 def _window_wall(rng: Generator, x: float, height: float, back: float, paint: Material) -> list[Thing]:
-    """The wall at x, with a hole; and what hangs in it."""
+    """Return the wall at x, with a hole, and the objects that hang in it."""
     low, high = rng.uniform(0.1, 0.9), height - rng.uniform(0.1, 0.5)
     near, far = rng.uniform(1.2, 3.0), rng.uniform(-back + 0.2, -0.2)
     pieces = [
@@ -234,7 +238,7 @@ def _window_wall(rng: Generator, x: float, height: float, back: float, paint: Ma
 
 
 def _furniture(rng: Generator, x: float, z: float) -> list[Thing]:
-    """A table, a chair, a shelf, a block or a plant; often with small things on top."""
+    """Return a table, a chair, a shelf, a block or a plant; often with small objects on top."""
     what = rng.choice(5, p=[0.3, 0.2, 0.15, 0.2, 0.15])
     if what == 4:
         return _potted(rng, rng.uniform(0.5, 0.9), x, z, 0.0)
@@ -269,7 +273,7 @@ def _camera(rng: Generator, kind: str) -> Camera:
 
 
 def _source(rng: Generator, kind: str) -> Source:
-    """A lamp, a panel that may be large, or a spot, somewhere about the scene."""
+    """Return a lamp, a panel that may be large, or a spot, at a random place about the scene."""
     form = ("sphere", "panel", "spot")[rng.choice(3, p=[0.35, 0.35, 0.3])]
     size = {
         "sphere": 0.03 * 15 ** rng.uniform(),
