@@ -63,7 +63,7 @@ class Family(Protocol[C]):
         """Return the guided velocity at those flow times: guidance 1 is the condition alone, 0 no strokes."""
 
     def decode_relit(self, x0: Array, condition: C) -> Array:
-        """Return the relit raster (h, w, 3), sRGB-encoded 0..1."""
+        """Return the relit raster (h, w, 3), sRGB-encoded, >= 0; 1 is display white."""
 
     def decode_lumi(self, x0: Array, condition: C) -> Array:
         """Return the estimated Lumi map of the raster (h, w, 3), linear >= 0."""
