@@ -17,7 +17,7 @@ MOST_SCALE: Final = 1000.0
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """What the caller asks of the sampler. A field that is None is left to the preset, then to the model."""
+    """The caller's options for the sampler. A field that is None is left to the preset, then to the model."""
 
     #: "reference", or the name of one of the model's presets, such as "fast".
     preset: str | None = None

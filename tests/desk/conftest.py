@@ -1,4 +1,4 @@
-"""A desk that is open, and a real browser; tests that need it skip with a reason where there is none."""
+"""An open desk, and a real browser. Tests that need the browser skip with a reason where there is none."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ FLAGS = [
 
 @dataclass(frozen=True)
 class Desk:
-    """A desk that is served. link: of its page; folder: of its temporary files."""
+    """A desk that is served. link: the link to its page; folder: the folder of its temporary files."""
 
     link: str
     host: str
@@ -51,7 +51,7 @@ def relighter(mini_bundle) -> Relighter:
 
 @pytest.fixture(scope="session")
 def photo_file(tmp_path_factory) -> Path:
-    """A photo of 480 x 320 with large soft areas, dark enough to be lit."""
+    """Write a photo of 480 x 320 with large soft areas, dark enough to be lit."""
     rng = np.random.default_rng(11)
     coarse = Image.fromarray(rng.integers(40, 130, (4, 6, 3), dtype=np.uint8))
     path = tmp_path_factory.mktemp("photos") / "scene.png"
@@ -109,7 +109,7 @@ def browser():
 
 @pytest.fixture
 def profile(browser):
-    """A browser with nothing stored."""
+    """Yield a browser with nothing stored."""
     context = browser.new_context(viewport={"width": 1280, "height": 800}, accept_downloads=True)
     yield context
     context.close()

@@ -1,4 +1,4 @@
-"""The page in a real browser: what a person does with mouse, pen and keyboard, and what is seen then.
+"""The page in a real browser: the user's actions with mouse, pen and keyboard, and the visible results.
 
 The main way through the page is always tested, the rest with -m slow.
 """
@@ -17,7 +17,7 @@ from PIL import Image
 from dior_rt.cli import run
 from dior_rt.project import read_project
 
-TIMEOUT = 60_000  # milliseconds; a busy machine takes its time
+TIMEOUT = 60_000  # milliseconds; a busy machine needs more time
 
 
 class Page:
@@ -41,7 +41,7 @@ class Page:
 
     @contextmanager
     def new_preview(self):
-        """Wait, after the block, until all that it asked for is seen."""
+        """Wait, after the block, until all that it requested is visible."""
         before = self.previews
         yield
         for _ in range(600):
@@ -60,7 +60,7 @@ class Page:
         return self.tab.locator(".said").inner_text()
 
     def at(self, x, y):
-        """A place on the photo, in shares of its sides, as a place on the screen."""
+        """Return the place on the screen of a place on the photo, in shares of its sides."""
         box = self.tab.locator(".stage").bounding_box()
         margin, (width, height) = 20, (480, 320)
         scale = min((box["width"] - 2 * margin) / width, (box["height"] - 2 * margin) / height)
@@ -69,7 +69,7 @@ class Page:
         return left + x * scale * width, top + y * scale * height
 
     def draw(self, *points):
-        """Pull the mouse over points of the photo."""
+        """Drag the mouse over points of the photo."""
         with self.new_preview():
             self.tab.mouse.move(*self.at(*points[0]))
             self.tab.mouse.down()
@@ -79,7 +79,7 @@ class Page:
         self.tab.mouse.move(*self.at(0.99, 0.01))
 
     def seen(self):
-        """What is on the stage, (200, 300, 3), without the brush's ring."""
+        """Return the content of the stage, (200, 300, 3), without the brush's ring."""
         left, top = self.at(0, 0)
         right, bottom = self.at(1, 1)
         clip = {"x": left, "y": top, "width": right - left, "height": bottom - top}
@@ -93,7 +93,7 @@ class Page:
         return self.tab.get_by_role("button", name=name, exact=True)
 
     def saved(self, tmp_path, name="saved.dior"):
-        """The project as the page saves it."""
+        """Return the project as the page saves it."""
         with self.tab.expect_download() as download:
             self.button("Save").click()
         path = tmp_path / name
@@ -112,7 +112,7 @@ STROKE = [(0.2, 0.2), (0.25, 0.4), (0.3, 0.6)]
 
 
 def change(before, after):
-    """Mean change of the part that was drawn on, and of the far corner."""
+    """Return the mean change of the part that was drawn on, and of the far corner."""
     difference = after - before
     return difference[60:100, 65:85].mean(), np.abs(difference[150:190, 230:290]).mean()
 

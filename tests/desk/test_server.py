@@ -65,7 +65,7 @@ def pixels(response):
     return np.asarray(Image.open(io.BytesIO(response.content)), np.int16)
 
 
-# Who may speak to it
+# Access control
 
 
 def test_a_stranger_without_the_token_is_refused(desk):

@@ -151,7 +151,7 @@ def test_a_file_size_limit_is_seen_before_the_driver_meets_it(tmp_path):
 
 
 def test_a_device_with_memory_of_its_own_passes_too(opencl):
-    """What a GPU is given: copies, a work item a cell or pixel, groups of the driver's choice, one lane."""
+    """The launch on a GPU: copies, a work item per cell or pixel, groups of the driver's choice, one lane."""
     ops = OpenCLOps(list_devices()[int(opencl.name.split()[0].removeprefix("opencl:"))])
     ops._session._shares_memory, ops._session._run, ops._session.lanes = False, 1, 1
     self_test(ops)

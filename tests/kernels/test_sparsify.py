@@ -1,4 +1,4 @@
-"""What a person might have drawn of a dense map: seeded, the same on every device, values kept."""
+"""Strokes cut from a dense map: seeded, the same on every device, with the map's values."""
 
 import hashlib
 

@@ -115,7 +115,7 @@ def test_every_bundle_tells_what_its_precision_costs(make):
 
 
 def test_lower_precisions_take_less_room(make):
-    # Of the blocks alone: the tiny autoencoder, float32 in all of them, outweighs everything else here.
+    # Only the blocks count: the tiny autoencoder, float32 in all of them, outweighs everything else here.
     sizes = {}
     for precision in ("fp32", "fp16", "int8", "int4"):
         file = make(precision=precision, steps=6) / "transformer" / "block.00.data"

@@ -16,7 +16,7 @@ from dior_rt.families.qwen.frame import Frame
 from dior_rt.families.qwen.model import Condition, Qwen
 from dior_rt.families.qwen.rope import joint_places, turns
 
-# What one call may cost, relative to the output's norm, on random weights.
+# The largest error of one call, relative to the output's norm, on random weights.
 BARS = {"fp32": 1e-5, "fp16": 2e-3, "int8": 5e-2, "int4": 2e-1}
 
 
@@ -130,7 +130,7 @@ def test_weights_of_zero_are_exact_in_int4():
 
 
 def test_the_random_model_is_no_trivial_one(pipes):
-    # Were prompt, references or time without effect, agreement would prove little.
+    # If prompt, references or time had no effect, agreement would prove little.
     model = tiny_qwen.transformer()
     x, text = torch.randn(1, 32, 16), torch.randn(1, 5, 32)
     shapes = [[(1, 4, 4), (1, 4, 4)]]

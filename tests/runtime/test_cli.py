@@ -236,7 +236,7 @@ def test_devices_names_what_the_options_take(mini_bundle: Path, folder: Path, ca
     assert said.count("  auto ") == 2 and all(name in said for names in usable.values() for name in names)
 
 
-# What goes wrong
+# Errors
 
 
 @pytest.fixture

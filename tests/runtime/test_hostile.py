@@ -206,7 +206,7 @@ def test_a_hundred_thousand_points_take_linear_time() -> None:
     assert many < 12 * few + 0.2 and many < 3
 
 
-# What nobody foresaw
+# Unexpected errors
 
 
 def test_the_last_resort_is_one_sentence_and_70(folder: Path, monkeypatch, capfd) -> None:

@@ -247,7 +247,7 @@ def test_a_folder_that_is_no_bundle_is_refused(tmp_path):
 
 @pytest.mark.parametrize("work", ["relight", "estimate"])
 def test_a_driver_that_fails_on_the_way_is_a_device_error(mini_bundle, monkeypatch, work):
-    """What OpenCLOps raises when a driver gives up in the middle of a run."""
+    """The error that OpenCLOps raises when a driver gives up in the middle of a run."""
     relighter = Relighter(mini_bundle, device="cpu", ops="numpy")
 
     def give_up(self, picture, grid):

@@ -108,7 +108,7 @@ def test_a_provider_that_computes_another_function_is_refused(hold, tmp_path, fa
 
 
 def test_a_graph_in_int8_does_not_pass_for_float32(hold, tmp_path):
-    """What a provider does that lowers precision by itself."""
+    """The int8 graph stands for a provider that lowers precision by itself."""
     shipped = read_bundle(default_bundle())
     graph = precisions.lower(shipped.path("velocity"), "int8", tmp_path / "model.onnx")
     lowered = with_graph(shipped, "velocity", graph, tmp_path / "lowered")

@@ -1,4 +1,4 @@
-"""The journal: what it remembers after any end of its process."""
+"""The journal: its content after any end of its process."""
 
 from __future__ import annotations
 

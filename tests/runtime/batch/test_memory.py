@@ -1,4 +1,4 @@
-"""A batch holds as many pixels in memory as it may, however many photos there are."""
+"""A batch keeps to its limit of pixels in memory, however many photos there are."""
 
 from __future__ import annotations
 

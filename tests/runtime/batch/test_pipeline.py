@@ -20,7 +20,7 @@ def jobs(count: int) -> list[Job]:
 
 
 class Load:
-    """Work that notes how many photos are in flight together."""
+    """A job that records how many photos are in flight at once."""
 
     def __init__(self, sizes: dict[str, int] | None = None) -> None:
         self.sizes, self.flying, self.most, self.most_pixels = sizes or {}, set(), 0, 0
@@ -50,7 +50,7 @@ def test_every_job_is_carried_through_once_and_side_by_side() -> None:
 def test_pixels_in_flight_are_bounded_and_a_giant_goes_alone() -> None:
     load = Load({"2": 50, "5": 200})
     list(run_jobs(jobs(9), load, 4, 51, threading.Event(), load.weigh))
-    assert load.most_pixels == 200  # the giant, by itself: together with any other it would be 201
+    assert load.most_pixels == 200  # the giant, alone: together with any other it would be 201
 
 
 def test_jobs_are_taken_as_they_are_needed() -> None:

@@ -1,4 +1,4 @@
-"""The plan: names of results, and what needs work."""
+"""The plan: names of results, and the photos that need work."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OUT = Path("out")
 
 @pytest.fixture
 def plan(make):
-    """A plan for the folder `in`."""
+    """Return a plan for the folder `in`."""
 
     def call(records=(), settings: str = "s", overwrite: bool = False) -> Plan:
         return make_plan(find_photos(["in"]), None, OUT, "png", dict(records), settings, overwrite)
@@ -26,7 +26,7 @@ def plan(make):
 
 
 def record(settings: str = "s") -> dict[str, Record]:
-    """What the journal holds of a.png once it is done."""
+    """Return the journal's record of a.png once it is done."""
     prints = (Print.of(Path(name)) for name in ("in/a.jpg", "in/a.json", "out/a.png"))
     return {"a.png": Record(*prints, settings=settings)}
 

@@ -1,4 +1,4 @@
-"""What a batch says of itself."""
+"""The output of a batch about its progress."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The engine on Ray, on two workers: the same bytes as the local engine, and no death loses a photo."""
+"""The engine on Ray, with two workers: its bytes equal the local engine's, and a dead worker loses no
+photo.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ PHOTOS = 16
 
 @pytest.fixture
 def command(tmp_path: Path, mini_bundle: Path, monkeypatch) -> list[str]:
-    """`dior-rt batch in` on the small bundle, in a folder with photos."""
+    """Return the command `dior-rt batch in` on the small bundle, in a folder with photos."""
     pytest.importorskip("ray.data")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "in").mkdir()
@@ -45,14 +47,14 @@ def results(folder: str) -> dict[str, bytes]:
 
 
 def wait_for(count: int, process: subprocess.Popen) -> None:
-    """Wait until so many results are there."""
+    """Wait until that number of results exists."""
     while len(results("out")) < count:
         assert process.poll() is None, process.communicate()
         time.sleep(0.01)
 
 
 def workers(driver: int) -> list[int]:
-    """The processes of a driver's actors."""
+    """Return the processes of a driver's actors."""
     parents, found = {}, []
     for entry in Path("/proc").iterdir():
         try:

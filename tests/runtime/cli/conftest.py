@@ -14,7 +14,7 @@ HEIGHT, WIDTH = 40, 60
 
 
 def make_photo(seed: int = 0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Image.Image:
-    """A smooth picture of its own colours."""
+    """Return a smooth picture of distinct colours."""
     y, x = np.mgrid[0 : 1 : size[0] * 1j, 0 : 1 : size[1] * 1j]
     base = np.random.default_rng(seed).uniform(0.2, 0.6, 3)
     photo = base + np.stack([0.3 * x, 0.3 * y, 0.3 * np.sin(9 * x * y)], -1)
@@ -22,7 +22,7 @@ def make_photo(seed: int = 0, size: tuple[int, int] = (HEIGHT, WIDTH)) -> Image.
 
 
 def make_strokes(size: tuple[int, int] = (HEIGHT, WIDTH)) -> Image.Image:
-    """A warm rectangle on a transparent layer."""
+    """Return a warm rectangle on a transparent layer."""
     strokes = np.zeros((*size, 4), np.uint8)
     strokes[size[0] // 8 : size[0] // 3, size[1] // 6 : size[1] // 2] = (255, 180, 100, 255)
     return Image.fromarray(strokes)
@@ -30,7 +30,7 @@ def make_strokes(size: tuple[int, int] = (HEIGHT, WIDTH)) -> Image.Image:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, with photo.png and strokes.png."""
+    """Return a working folder with photo.png and strokes.png."""
     monkeypatch.chdir(tmp_path)
     make_photo().save("photo.png")
     make_strokes().save("strokes.png")
@@ -39,7 +39,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def model(mini_bundle: Path) -> list[str]:
-    """Options that choose the small bundle and the kernels that start fastest."""
+    """Return the options that choose the small bundle and the kernels that start fastest."""
     return ["--bundle", str(mini_bundle), "--ops", "numpy"]
 
 

@@ -1,4 +1,4 @@
-"""`dior-rt batch`: results, what is done again, what is kept, and a kill in the middle."""
+"""`dior-rt batch`: results, repeated work, files that are kept, and a kill in the middle."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def batch(folder: Path, model: list[str], capfd) -> Batch:
 
 
 def fill(folder: Path, count: int) -> None:
-    """Photos 0.png, 1.png ... of different colours, each with its strokes."""
+    """Write photos 0.png, 1.png ... of different colours, each with its strokes."""
     folder.mkdir()
     for i in range(count):
         make_photo(i).save(folder / f"{i}.png")

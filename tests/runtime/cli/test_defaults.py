@@ -1,4 +1,4 @@
-"""Defaults of a person's own: file, environment, command line; and the shells' completion."""
+"""The user's defaults: file, environment, command line; and the shells' completion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from dior_rt.images.metadata import read_settings
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Write the configuration file; DIOR_CONFIG names it."""
+    """Return a function that writes the configuration file, which DIOR_CONFIG names."""
     monkeypatch.setenv("DIOR_CONFIG", str(tmp_path / "config.toml"))
 
     def write(text: str) -> Path:

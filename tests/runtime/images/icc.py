@@ -30,18 +30,18 @@ SRGB_CURVE = struct.pack(
 
 
 def gamma(value: float) -> bytes:
-    """A curveType tag of one power."""
+    """Return a curveType tag of one power."""
     return struct.pack(">4sIIHxx", b"curv", 0, 1, round(value * 256))
 
 
 def table(values: Sequence[float]) -> bytes:
-    """A curveType tag of a table of values 0..1."""
+    """Return a curveType tag of a table of values 0..1."""
     codes = [round(v * 65535) for v in values]
     return struct.pack(f">4sII{len(codes)}H", b"curv", 0, len(codes), *codes)
 
 
 def rgb_profile(space: tuple, curve: bytes) -> bytes:
-    """A display profile of primaries and a white point (xy), with one curve for all channels."""
+    """Return a display profile of primaries and a white point (xy), with one curve for all channels."""
     red, green, blue = to_xyz(space).T
     tags = {b"rXYZ": _xyz_tag(red), b"gXYZ": _xyz_tag(green), b"bXYZ": _xyz_tag(blue)}
     return _profile(b"RGB ", tags | dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve))
@@ -60,7 +60,7 @@ def table_profile(kind: bytes, curve: np.ndarray, corners: np.ndarray) -> bytes:
 
 
 def to_xyz(space: tuple) -> np.ndarray:
-    """(3, 3): linear RGB of primaries and a white point (xy) -> XYZ under D50."""
+    """Return (3, 3), linear RGB of primaries and a white point (xy) -> XYZ under D50."""
     primaries, white = space
     columns = np.array([_xyz(xy) for xy in primaries]).T
     scaled = columns * np.linalg.solve(columns, _xyz(white))
@@ -69,7 +69,7 @@ def to_xyz(space: tuple) -> np.ndarray:
 
 
 def grey_profile(curve: bytes) -> bytes:
-    """A display profile of a grey picture."""
+    """Return a display profile of a grey picture."""
     return _profile(b"GRAY", {b"kTRC": curve})
 
 

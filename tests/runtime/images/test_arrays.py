@@ -1,4 +1,4 @@
-"""Photos and strokes in memory: every kind that is taken, every kind that is refused."""
+"""Photos and strokes in memory: every kind that is accepted, and every kind that is refused."""
 
 import sys
 from pathlib import Path

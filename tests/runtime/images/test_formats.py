@@ -23,7 +23,7 @@ SIZE = (48, 64)
 
 
 def ramp(dtype: type = np.uint16) -> np.ndarray:
-    """(H, W, 3): a smooth picture that uses all codes."""
+    """Return (H, W, 3): a smooth picture that uses all codes."""
     y, x = np.mgrid[0 : 1 : SIZE[0] * 1j, 0 : 1 : SIZE[1] * 1j]
     top = np.iinfo(dtype).max
     return np.round(np.stack([x, y, (x + y) / 2], -1) * top).astype(dtype)
@@ -37,14 +37,14 @@ def write_heic(path: Path, samples: np.ndarray, bits: int = 8, **more: object) -
 
 
 def write_psd(path: Path, samples: np.ndarray) -> None:
-    """A flat RGB document without layers, uncompressed."""
+    """Write a flat RGB document without layers, uncompressed."""
     height, width, _ = samples.shape
     header = b"8BPS" + struct.pack(">H6xHIIHH", 1, 3, height, width, 8, 3)
     path.write_bytes(header + struct.pack(">III", 0, 0, 0) + b"\0\0" + samples.transpose(2, 0, 1).tobytes())
 
 
 def write_dng(path: Path, mosaic: np.ndarray, neutral: tuple[int, int, int] = (1, 1, 1)) -> None:
-    """A camera's RGGB mosaic, linear, 16 bits; neutral: what the camera counts of grey, times 2."""
+    """Write a camera's RGGB mosaic, linear, 16 bits. neutral: the camera's counts of grey, times 2."""
     tifffile = pytest.importorskip("tifffile")
     matrix = [32406, 10000, -15372, 10000, -4986, 10000, -9689, 10000, 18758, 10000, 415, 10000]
     matrix += [557, 10000, -2040, 10000, 10570, 10000]  # XYZ -> linear sRGB: a camera with those primaries
@@ -63,7 +63,7 @@ def write_dng(path: Path, mosaic: np.ndarray, neutral: tuple[int, int, int] = (1
 
 
 def mosaic(colours: np.ndarray) -> np.ndarray:
-    """(H, W, 3) -> what an RGGB sensor sees of it."""
+    """Return the picture (H, W, 3) as an RGGB sensor records it."""
     raw = colours[..., 1].copy()
     raw[::2, ::2], raw[1::2, 1::2] = colours[::2, ::2, 0], colours[1::2, 1::2, 2]
     return raw

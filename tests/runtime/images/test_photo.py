@@ -34,7 +34,7 @@ COARSE = icc.rgb_profile(icc.ADOBE_RGB, icc.table(np.linspace(0, 1, 256) ** 2.2)
 
 
 def scene(height: int = 23, width: int = 31, channels: int = 3, dtype: type = np.uint8) -> np.ndarray:
-    """Smooth colours with noise: no two corners, rows or columns are alike."""
+    """Return smooth colours with noise: no two corners, rows or columns are alike."""
     rng = np.random.default_rng(5)
     y, x = np.mgrid[0 : 1 : height * 1j, 0 : 1 : width * 1j]
     waves = np.stack([np.sin(3 * x + c) * np.cos(2 * y * (c + 1)) for c in range(channels)], -1)
@@ -43,7 +43,7 @@ def scene(height: int = 23, width: int = 31, channels: int = 3, dtype: type = np
 
 
 def deep_png(path: Path, samples: np.ndarray, **options: object) -> None:
-    """A 16-bit PNG by pypng."""
+    """Write a 16-bit PNG by pypng."""
     height, width, channels = samples.shape
     writer = png.Writer(
         width, height, bitdepth=16, greyscale=channels < 3, alpha=channels in (2, 4), **options
@@ -262,7 +262,7 @@ def test_an_untouched_wide_gamut_photo_comes_out_as_it_went_in(
 
 @pytest.mark.parametrize("profile", [P3, ADOBE, PROPHOTO, COARSE], ids=["p3", "adobe", "prophoto", "coarse"])
 def test_curves_agree_with_littlecms(tmp_path: Path, profile: bytes) -> None:
-    # On greys the primaries do not matter: what is left of a conversion to sRGB is the curve.
+    # The primaries do not change greys, so only the curve of a conversion to sRGB remains.
     ramp = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, -1)
     Image.fromarray(ramp).save(tmp_path / "in.png", icc_profile=profile)
     ours = read_photo(tmp_path / "in.png").pixels

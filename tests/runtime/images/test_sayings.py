@@ -1,4 +1,4 @@
-"""What a file says of itself: metadata, colour, depth, pages and place, each with the value that is right."""
+"""The facts that a file states: metadata, colour, depth, pages and place, each with the correct value."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SIZE = (23, 31)
 
 
 def scene(height: int = 23, width: int = 31, dtype: type = np.uint8, channels: int = 3) -> np.ndarray:
-    """Noise: no two corners, rows or columns are alike."""
+    """Return noise: no two corners, rows or columns are alike."""
     rng = np.random.default_rng(5)
     return rng.integers(0, np.iinfo(dtype).max, (height, width, channels), dtype=dtype, endpoint=True)
 
@@ -190,7 +190,7 @@ def test_the_photographers_own_comment_stays_and_has_the_right_type(
 
 
 def light_of(pixels: np.ndarray, space: tuple) -> np.ndarray:
-    """XYZ under D50 of 8-bit pixels on the sRGB curve."""
+    """Return XYZ under D50 of 8-bit pixels on the sRGB curve."""
     from dior_rt.kernels.color import srgb_to_linear
 
     return srgb_to_linear(pixels / np.iinfo(pixels.dtype).max) @ icc.to_xyz(space).T
@@ -228,7 +228,7 @@ def test_png_gamma_is_honoured_and_comes_out_as_it_went_in(tmp_path: Path) -> No
     write_photo(tmp_path / "out.png", photo, {})
     with Image.open(tmp_path / "out.png") as image:
         np.testing.assert_array_equal(np.asarray(image), scene())
-    # What most programs mean by 0.45455 is sRGB, and the chunk sRGB stands over both.
+    # Most programs use 0.45455 to mean sRGB, and the chunk sRGB overrides both.
     for chunks in (
         [(b"gAMA", struct.pack(">I", 45_455))],
         [(b"sRGB", b"\0"), (b"gAMA", struct.pack(">I", 100_000))],
@@ -248,7 +248,7 @@ def test_hdr_is_refused_by_its_name(tmp_path: Path) -> None:
 
 
 def avif(path: Path, primaries: int, transfer: int) -> None:
-    """An AVIF whose colr box holds these codes."""
+    """Write an AVIF whose colr box holds these codes."""
     Image.fromarray(scene(64, 64)).save(path, quality=100, subsampling="4:4:4")
     data = bytearray(path.read_bytes())
     at = data.index(b"colrnclx")
@@ -355,7 +355,7 @@ def test_notices_of_the_strokes_file_are_passed_on(tmp_path: Path) -> None:
 
 
 def raw_file(path: Path, order: str = "<") -> None:
-    """A DNG's bones: a thumbnail in front, the mosaic in a directory below."""
+    """Write the minimal parts of a DNG: a thumbnail in front, the mosaic in a directory below."""
     small = scene(10, 16).tobytes()
     tifffile.imwrite(
         path,

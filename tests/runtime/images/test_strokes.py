@@ -1,4 +1,4 @@
-"""Strokes and Lumi maps from files: known colours, every kind, sizes, and what is refused."""
+"""Strokes and Lumi maps from files: expected colours, every kind, sizes, and refusals."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SIZE = (40, 60)  # the photo's rows and columns
 
 
 def lumi(height: int = 12, width: int = 18) -> np.ndarray:
-    """A smooth map with light above display white."""
+    """Return a smooth map with light above display white."""
     y, x = np.mgrid[0 : 1 : height * 1j, 0 : 1 : width * 1j]
     return np.stack([3 * x, y, 0.2 + 0 * x], -1).astype(np.float32)
 
 
 def drawn(raster: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The grid that the kernels see of a raster: (light, mask)."""
+    """Return the grid of a raster that the kernels see: (light, mask)."""
     grid = NumpyOps().reduce_strokes(raster[..., :3], raster[..., 3], raster.shape[:2])
     return grid.light, grid.mask
 

@@ -1,4 +1,4 @@
-"""What the network promises before it has learnt anything."""
+"""The guarantees of the untrained network."""
 
 from __future__ import annotations
 
