@@ -116,7 +116,8 @@ class Lumen:
         light, bounce = condition["light"], condition["bounce"]
         ratio = log_ratio(light, lumi_from_x0(x0), bounce)
         relit = apply_log_ratio(decode_small(condition["photo"]), np.clip(ratio, -6, 6))
-        return _pixels(linear_to_srgb(relit))  # above 1 too: the photo's size decides what the display clips
+        # Light above display white stays: what the display clips is decided at the size of the photo.
+        return _pixels(linear_to_srgb(relit).astype(np.float32))
 
     def decode_lumi(self, x0: Array, condition: Condition) -> Array:
         return _pixels(lumi_from_x0(x0))
