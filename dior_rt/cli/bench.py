@@ -96,7 +96,7 @@ def bench(
     repeats = repeats or (1 if quick else 5)
     settings = sweep(
         bundles,
-        _kernels(ops),
+        _kernels(ops, usable_only=bool(device)),
         device or available(),
         steps or (QUICK_STEPS if quick else STEPS),
         () if quick else thread_counts(usable_cores()),
@@ -117,8 +117,12 @@ def bench(
         draw(plot, report)
 
 
-def _kernels(asked: list[str] | None) -> list[str]:
-    """Return the pixel kernels to measure. The first is the reference: the best, or the first requested."""
+def _kernels(asked: list[str] | None, usable_only: bool) -> list[str]:
+    """Return the pixel kernels to measure. The first is the reference: the best, or the first requested.
+
+    usable_only: leave out OpenCL devices that nobody requested and that cannot be opened. Otherwise the
+    report lists them; but where a network's device is requested, a setting that fails ends the benchmark.
+    """
     from dior_rt.kernels import KernelError, list_devices, open_ops
 
     try:
@@ -131,7 +135,19 @@ def _kernels(asked: list[str] | None) -> list[str]:
         devices = [f"opencl:{device.index}" for device in list_devices()]
     except KernelError:  # there is no OpenCL
         devices = []
+    if usable_only:
+        devices = [name for name in devices if _opens(name)]
     return list(dict.fromkeys([best, *devices, "numpy"]))
+
+
+def _opens(name: str) -> bool:
+    from dior_rt.kernels import KernelError, open_ops
+
+    try:
+        open_ops(name)
+    except KernelError:
+        return False
+    return True
 
 
 def _lpips() -> Distance:
