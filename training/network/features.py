@@ -121,13 +121,23 @@ def around(cells: Tensor, deviation: float) -> Tensor:
     return down @ cells @ along.T
 
 
+def repeat_border(cells: Tensor) -> Tensor:
+    """Repeat the outermost cells once on every side: (B, C, h, w) to (B, C, h + 2, w + 2).
+
+    These are slices, because torch.compile lays out the gradient of a replicating pad wrongly where channels
+    lie side by side.
+    """
+    rows = torch.cat([cells[:, :, :1], cells, cells[:, :, -1:]], dim=2)
+    return torch.cat([rows[..., :1], rows, rows[..., -1:]], dim=3)
+
+
 def mix_neighbours(cells: Tensor) -> Tensor:
     """Mix every cell with its neighbours by 1, 2, 1 in both directions, (B, C, h, w) -> (B, C, h, w).
 
     Cells that are made of one token get separate weights, whose differences would show as a weave in a smooth
     sky. The mix removes any pattern with a period of two cells.
     """
-    return F.avg_pool2d(F.avg_pool2d(F.pad(cells, (1, 1, 1, 1), mode="replicate"), 2, 1), 2, 1)
+    return F.avg_pool2d(F.avg_pool2d(repeat_border(cells), 2, 1), 2, 1)
 
 
 def mean_of_picture(cells: Tensor) -> Tensor:
