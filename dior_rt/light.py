@@ -25,6 +25,8 @@ Array = NDArray[np.float32]
 #: Light, as a share of display white, that is added to both sides of a quotient. Black can then be lit, and
 #: the dark parts of a photo below it have little influence.
 FLOOR: Final = EPSILON
+#: Light that reaches a surface where no source shines: it has bounced there.
+BOUNCED: Final = 0.02
 #: Scale of the logarithm in which light is encoded: log(1 + LUMI_SCALE L).
 LUMI_SCALE: Final = 8.0
 #: The light that is encoded as 1 in the pictures of Lumi maps for qwen.

@@ -25,13 +25,12 @@ from dior_rt.flow.sampler import Array, Condition, Velocity, guide
 from dior_rt.flow.schedule import ShiftSchedule
 from dior_rt.kernels import Ops, Strokes
 from dior_rt.kernels.color import linear_to_srgb
-from dior_rt.light import apply_log_ratio, decode_small, encode_lumi, lumi_from_x0
+from dior_rt.light import BOUNCED, apply_log_ratio, decode_small, encode_lumi, lumi_from_x0
 
 #: The scene graph's outputs; GIVEN: those that the light graph takes.
 SCENE: Final = ("light", "normal", "depth", "sky", "albedo", "bounce", "fine", "half", "quarter", "tokens")
 GIVEN: Final = ("light", "normal", "depth", "sky", "fine", "half", "quarter", "tokens")
 SET: Final = 0  # the blend mode of strokes that say what the light is
-BOUNCED: Final = np.float32(0.02)
 SIDE: Final = 128
 NEARBY: Final = SIDE / 10  # cells: how far light bounces to its surroundings
 

@@ -14,6 +14,7 @@ from dior_rt.kernels import Strokes
 torch = pytest.importorskip("torch")
 
 from dior_rt.export.lumen import LumenExportConfig, export_network  # noqa: E402
+from dior_rt.training.light import linear_to_srgb  # noqa: E402
 from dior_rt.training.lumen import shading  # noqa: E402
 from dior_rt.training.lumen.completion import Strokes as Drawn  # noqa: E402
 from dior_rt.training.lumen.config import LumenConfig  # noqa: E402
@@ -59,7 +60,7 @@ def test_the_runtime_relights_as_torch_does(tmp_path: Path) -> None:
     with torch.no_grad():
         _, _, right = network(torch.zeros_like(planes), torch.ones(1), planes, strokes)
     found = np.asarray(relit).clip(0, 1)[8:-8:16, 8:-8:16]
-    right = shading.linear_to_srgb(right.clamp(0, 1))[0].permute(1, 2, 0).numpy()[8:-8:16, 8:-8:16]
+    right = linear_to_srgb(right.clamp(0, 1))[0].permute(1, 2, 0).numpy()[8:-8:16, 8:-8:16]
     assert np.abs(found - right).mean() < 0.02
     estimate = relighter.estimate(photo)
     with torch.no_grad():

@@ -15,12 +15,13 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
+from dior_rt.training.light import encode_lumi, linear_to_srgb, srgb_to_linear
 from dior_rt.training.lumen.brush import Brush, draw, random_brush, starts, touched
 from dior_rt.training.lumen.camera import random_cameras
 from dior_rt.training.lumen.completion import FACTOR_SCALE, Strokes
 from dior_rt.training.lumen.lamps import at, cells_at, lamps_along, nearest, positions
 from dior_rt.training.lumen.materials import factors
-from dior_rt.training.lumen.optics import encode_light, linear_to_srgb, luminance, srgb_to_linear
+from dior_rt.training.lumen.optics import luminance
 from dior_rt.training.lumen.strokes import ADD, LEAST_FACTOR, MULTIPLY, SET, peak
 from dior_rt.training.lumen.views import Views, from_code
 
@@ -465,7 +466,7 @@ def data_variable(strokes: Strokes, light: Tensor, target: Tensor) -> Tensor:
     mode = strokes.blend[:, None, None, None]
     added = (target - light).clamp_min(0) / peak(strokes.drawn, strokes.mask)
     factor = torch.log(((target + 0.01) / (light + 0.01)).clamp(LEAST_FACTOR, 64))
-    code = 2 * encode_light(torch.where(mode == ADD, added, target)) - 1
+    code = 2 * encode_lumi(torch.where(mode == ADD, added, target)) - 1
     return torch.where(mode == MULTIPLY, FACTOR_SCALE * factor, code)
 
 

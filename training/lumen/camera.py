@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
-from dior_rt.training.lumen.optics import blur, linear_to_srgb, luminance
+from dior_rt.training.light import linear_to_srgb
+from dior_rt.training.lumen.optics import blur, luminance
 
 PLAIN_SHARE = 0.3  # share of cameras that do nothing but encode
 

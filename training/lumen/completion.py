@@ -19,9 +19,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dior_rt.light import BOUNCED
+from dior_rt.training.light import decode_lumi, encode_lumi
 from dior_rt.training.lumen.config import PATCH, SIDE, LumenConfig
 from dior_rt.training.lumen.layers import Block, Down, Residual, Up, rotations, waves
-from dior_rt.training.lumen.optics import BOUNCED, decode_light, encode_light, log_light, spread
+from dior_rt.training.lumen.optics import log_light, spread
 from dior_rt.training.lumen.scene import Scene
 from dior_rt.training.lumen.strokes import (
     ADD,
@@ -101,7 +103,7 @@ class LightNetwork(nn.Module):
         clear = clarity(sigma)
         mode = strokes.blend * 2 + strokes.far
         depth = scene.depth - scene.depth.mean(dim=(2, 3), keepdim=True)
-        seen = [photo, scene.normal, depth, torch.sigmoid(scene.sky), encode_light(scene.light)]
+        seen = [photo, scene.normal, depth, torch.sigmoid(scene.sky), encode_lumi(scene.light)]
         state = x * clear[:, None, None, None]
         fine = self.see(torch.cat([features, state, *seen], dim=1)) + self.scene_fine(scene.fine)
         fine = F.silu(fine + self.mode_fine(mode)[:, :, None, None])  # (B, fine, H, W)
@@ -129,7 +131,7 @@ def compose(maps: Tensor, colours: Tensor, scene: Scene, strokes: Strokes) -> Co
     mode = strokes.blend[:, None, None, None]
     is_set, is_add, is_multiply = (mode == SET).float(), (mode == ADD).float(), (mode == MULTIPLY).float()
     code = (oriented[:, :3] * scene.normal).sum(dim=1, keepdim=True) + oriented[:, 3:]
-    bright = decode_light(F.softplus(code, beta=8.0).clamp(max=2.5))
+    bright = decode_lumi(F.softplus(code, beta=8.0).clamp(max=2.5))
     tint = (torch.softmax(shares, dim=1)[:, :, None] * colours).sum(dim=1)  # (B, 3, H, W)
     scale = is_set + is_add * peak(drawn, mask)
     anything = (mask.amax(dim=(1, 2, 3), keepdim=True) > 0).float()  # without strokes nothing changes
@@ -140,7 +142,7 @@ def compose(maps: Tensor, colours: Tensor, scene: Scene, strokes: Strokes) -> Co
     factor = is_multiply * _factor(reach, drawn, mask)
     target = target * torch.exp(factor)
     code = is_set * target + is_add * added
-    x0 = (1 - is_multiply) * (2 * encode_light(code) - 1) + FACTOR_SCALE * factor
+    x0 = (1 - is_multiply) * (2 * encode_lumi(code) - 1) + FACTOR_SCALE * factor
     return Completed(target, factor, x0)
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-from dior_rt.training.lumen.optics import srgb_to_linear
+from dior_rt.training.light import srgb_to_linear
 
 OBJECTS = 256
 TILE = 128

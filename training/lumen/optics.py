@@ -1,41 +1,13 @@
-"""Colour and light encodings as batched torch operations. All pictures are (B, C, H, W)."""
+"""Batched operations on light, beside those of `dior_rt.training.light`. Pictures are (B, C, H, W)."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 from torch import Tensor
 
-LUMI_SCALE = 8.0  # encode(L) = log(1 + 8 L) / log 9: 0 to 0, 1 to 1
-FLOOR = 0.02  # added to a photo's linear values before a ratio is taken, so that black can be lit
-BOUNCED = 0.02  # light that reaches a surface where no source shines
+from dior_rt.light import BOUNCED
+
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # ITU-R BT.709
-
-
-def srgb_to_linear(encoded: Tensor) -> Tensor:
-    """Return linear light (IEC 61966-2-1) of values in 0..1."""
-    curve = ((encoded.clamp_min(0.04) + 0.055) / 1.055) ** 2.4
-    return torch.where(encoded <= 0.04045, encoded / 12.92, curve)
-
-
-def linear_to_srgb(linear: Tensor) -> Tensor:
-    """Return encoded values (IEC 61966-2-1) of light in 0..1.
-
-    The straight part near black continues below 0.
-    """
-    curve = 1.055 * linear.clamp_min(0.003) ** (1 / 2.4) - 0.055
-    return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
-
-
-def encode_light(light: Tensor) -> Tensor:
-    """Map light 0..inf to log(1 + 8 L) / log 9."""
-    return torch.log1p(LUMI_SCALE * light) / math.log1p(LUMI_SCALE)
-
-
-def decode_light(encoded: Tensor) -> Tensor:
-    """Invert `encode_light`; negative codes become 0."""
-    return torch.expm1(encoded.clamp_min(0) * math.log1p(LUMI_SCALE)) / LUMI_SCALE
 
 
 def luminance(colour: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from dior_rt.errors import InputError
 from dior_rt.training.blender.store import load_view
-from dior_rt.training.lumen.optics import linear_to_srgb
+from dior_rt.training.light import linear_to_srgb
 from dior_rt.training.lumen.views import Views, to_code
 
 LARGEST = 55_000_000  # bytes per shard

@@ -16,10 +16,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from dior_rt.training.light import decode_lumi, srgb_to_linear
 from dior_rt.training.lumen.backbone import FEATURES, Backbone
 from dior_rt.training.lumen.config import PATCH, LumenConfig
 from dior_rt.training.lumen.layers import Block, Down, Residual, Up, rotations
-from dior_rt.training.lumen.optics import decode_light, double, luminance, srgb_to_linear
+from dior_rt.training.lumen.optics import double, luminance
 
 NORMAL, DEPTH, SKY, ALBEDO = 3, 1, 1, 3  # channels of the geometry head
 ORIENTATION = 4  # factors of the normal's three components and a constant on brightness
@@ -102,7 +103,7 @@ class SceneNetwork(nn.Module):
         maps = double(self.light(half).float())
         oriented, shares, bounce = maps.split((ORIENTATION, colours, BOUNCES), dim=1)
         code = (oriented[:, :3] * normal).sum(dim=1, keepdim=True) + oriented[:, 3:]
-        bright = decode_light(F.softplus(code, beta=8.0).clamp(max=2.5))
+        bright = decode_lumi(F.softplus(code, beta=8.0).clamp(max=2.5))
         tint = palette(self.palette(pooled).float().unflatten(1, (colours, 3)))  # (B, colours, 3)
         mixed = torch.einsum("bkhw,bkc->bchw", torch.softmax(shares, dim=1), tint)
         return bright * mixed, F.softplus(bounce)

@@ -12,8 +12,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dior_rt.light import BOUNCED
+from dior_rt.training.light import FLOOR, linear_to_srgb, srgb_to_linear
 from dior_rt.training.lumen.config import SIDE
-from dior_rt.training.lumen.optics import BOUNCED, FLOOR, blur, linear_to_srgb, srgb_to_linear
+from dior_rt.training.lumen.optics import blur
 
 NEARBY = 1 / 10  # share of the grid's side over which light bounces
 

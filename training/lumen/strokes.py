@@ -14,8 +14,9 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from dior_rt.training.light import encode_lumi
 from dior_rt.training.lumen.config import SIDE
-from dior_rt.training.lumen.optics import encode_light, log_light, luminance, spread
+from dior_rt.training.lumen.optics import log_light, luminance, spread
 
 SET, ADD, MULTIPLY = 0, 1, 2
 BLENDS: Final = {"set": SET, "add": ADD, "multiply": MULTIPLY}
@@ -51,7 +52,7 @@ def stroke_features(drawn: Tensor, mask: Tensor, blend: Tensor, light: Tensor) -
     is_set, is_add = (mode == SET).to(drawn), (mode == ADD).to(drawn)
     is_multiply = 1 - is_set - is_add
     ratio = is_set * (log_light(drawn) - log_light(light)) + is_multiply * log_factor(drawn)
-    code = encode_light(drawn * is_set + drawn / peak(drawn, mask) * is_add)
+    code = encode_lumi(drawn * is_set + drawn / peak(drawn, mask) * is_add)
     values = torch.cat([ratio, code], dim=1)
     near, far = (around(values, mask, share * SIDE) for share in (NEAR, FAR))
     features = torch.cat([values * mask, mask, near, far], dim=1)

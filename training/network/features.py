@@ -14,11 +14,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from dior_rt.light import BOUNCED
 from dior_rt.training.light import LUMI_SCALE, encode_lumi
 from dior_rt.training.network.config import MASK, RGB
 
-#: Light that bounces to places where no source shines directly. Drawn darkness is therefore not black.
-BOUNCED: Final = 0.02
 #: Largest encoded source light that is used: 820 times white, far below overflow.
 BRIGHTEST: Final = 4.0
 #: Share of drawn cells around a cell at which a spread has half weight.

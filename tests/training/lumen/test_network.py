@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from dior_rt.errors import InputError
+from dior_rt.training.light import srgb_to_linear
 from dior_rt.training.lumen.batches import Batch, BatchMaker
 from dior_rt.training.lumen.checkpoint import load_lumen, save_lumen
 from dior_rt.training.lumen.completion import Completed, Strokes, hold
 from dior_rt.training.lumen.loss import loss
 from dior_rt.training.lumen.model import Lumen
-from dior_rt.training.lumen.optics import blur, double, luminance, srgb_to_linear
+from dior_rt.training.lumen.optics import blur, double, luminance
 from dior_rt.training.lumen.shading import log_ratio, relight
 from dior_rt.training.lumen.strokes import ADD, MULTIPLY, SET
 from dior_rt.training.lumen.views import Views

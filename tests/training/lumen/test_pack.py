@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dior_rt.errors import InputError
-from dior_rt.training.lumen.optics import linear_to_srgb
+from dior_rt.training.light import linear_to_srgb
 from dior_rt.training.lumen.pack import SKY, load_shards, sheet, tiles_of, write_shards
 from dior_rt.training.lumen.views import Views, from_code, to_code
 from tests.training.lumen.balls import ball
