@@ -14,11 +14,18 @@ from typing import Final, Literal
 import numpy as np
 from torch import Tensor
 
-from dior_rt.bundle import Bundle, Graph, Manifest, check_target, write_bundle
+from dior_rt.bundle import Bundle, Graph, check_target, write_bundle
 from dior_rt.engine import Engine, Feeds
-from dior_rt.errors import InputError
 from dior_rt.export.check import ExportError, relative_error
-from dior_rt.export.mini import LARGE, GraphPart, answers, open_checked, write_graph
+from dior_rt.export.mini import (
+    LARGE,
+    GraphPart,
+    MiniExportConfig,
+    answers,
+    describe,
+    open_checked,
+    write_graph,
+)
 from dior_rt.families import lumen
 from dior_rt.flow.sampler import draw_noise
 from dior_rt.flow.schedule import ShiftSchedule
@@ -35,15 +42,13 @@ SIGMAS: Final = (1.0, 0.9, 0.5, 0.1)
 
 
 @dataclass(frozen=True)
-class LumenExportConfig:
-    """How a network is to be run; the fields are the manifest's."""
+class LumenExportConfig(MiniExportConfig):
+    """How to run a network: mini's fields with other defaults."""
 
     name: str = "lumen"
     grid: GridRule = field(default_factory=lambda: GridRule(cells=16384, multiple=PATCH, longest=512))
     schedule: ShiftSchedule = field(default_factory=lambda: ShiftSchedule(3.0))
     steps: int = 1
-    guidance: float = 1.0
-    noise_scale: float = 1.0
 
 
 class SceneGraph(GraphPart):
@@ -140,7 +145,7 @@ def export_network(
         for weight in network.parameters():
             if weight.numel() >= LARGE:
                 weight.data = weight.data.half().float()
-    manifest = describe(config, weights)
+    manifest = describe(config, weights, "lumen")
     with tempfile.TemporaryDirectory() as scratch:
         parts: dict[str, GraphPart] = {
             "scene": SceneGraph(network),
@@ -171,24 +176,3 @@ def error_of(part: GraphPart, engine: Engine, grid: GridRule) -> float:
         right, found = answers(part, feeds), engine.run(feeds)
         worst = max(worst, *(relative_error(found[name], right[name]) for name in part.outputs))
     return worst if math.isfinite(worst) else math.inf
-
-
-def describe(config: LumenExportConfig, weights: Weights) -> Manifest:
-    """Return the manifest of an export without its graphs. Raises InputError for an invalid config."""
-    try:
-        return Manifest(
-            family="lumen",
-            name=config.name,
-            licence="Apache-2.0",
-            precision=weights,
-            files={},
-            graphs={},
-            schedule=config.schedule,
-            steps=config.steps,
-            guidance=config.guidance,
-            grid=config.grid,
-            noise_scale=config.noise_scale,
-            parity={},
-        )
-    except ValueError as error:
-        raise InputError(f"The model cannot be run so: {error}.") from error

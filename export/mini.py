@@ -311,11 +311,11 @@ def open_checked(graph: Path) -> Engine:
     return Engine(graph)
 
 
-def describe(config: MiniExportConfig, weights: Weights) -> Manifest:
+def describe(config: MiniExportConfig, weights: Weights, family: str = "mini") -> Manifest:
     """Return the manifest of an export before its graphs exist. Raises InputError for an invalid config."""
     try:
         return Manifest(
-            family="mini",
+            family=family,
             name=config.name,
             licence="Apache-2.0",
             precision=weights,

@@ -19,7 +19,6 @@ from dior_rt.training.lumen.config import SIDE
 from dior_rt.training.lumen.optics import log_light, luminance, spread
 
 SET, ADD, MULTIPLY = 0, 1, 2
-BLENDS: Final = {"set": SET, "add": ADD, "multiply": MULTIPLY}
 LEAST_FACTOR: Final = 0.02  # the smallest factor, which keeps its logarithm finite
 NEAR: Final = 1 / 16  # share of the grid's side over which strokes inform their surroundings
 FAR: Final = 1 / 4
